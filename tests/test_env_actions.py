@@ -5,34 +5,27 @@ import numpy as np
 import pytest
 import torch
 from reference.refusals import user_error
-from reference.worlds import environment, placed, same_bits, step, vehicles
+from reference.worlds import environment, few_changes, placed, run, same_bits, step, vehicles
 from torchrl.envs.utils import check_env_specs
 
 import ganlane
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.settings.actions import ActionParameters
-from ganlane.settings.road import WALL, LaneStretch, Stretches
 from ganlane.transforms import ActionMaskTransform, observation_size
 
 KEEP, LEFT, RIGHT, FASTER, SLOWER = range(5)
 FAR = {"x": -900.0}
 
 
-def alone(form: str, *, stretches: Stretches = (), lanes: int = 3, **ego: float) -> tuple:
+def alone(form: str, **ego: float) -> tuple:
     """An environment and its state, with the ego alone in the right lane at 20 m/s."""
-    env = environment(
-        lanes, vehicles=2, mobil=False, stretches=stretches, actions=ActionParameters(form)
-    )
+    env = environment(vehicles=2, mobil=False, actions=ActionParameters(form))
     return env, placed(env, vehicles({"x": 0.0, "visibility": 1, **ego}, FAR))
 
 
 def driven(env: HighwayEnv, td, action, decisions: int):
-    for _ in range(decisions):
-        td = step(env, td, action)
-        if td["done"]:
-            break
-    return td
+    return run(env, decisions, lambda _: action, td)[-1]
 
 
 def ego(td, name: str) -> float:
@@ -51,21 +44,12 @@ def test_an_ego_that_is_told_slower_slows_down_to_the_lowest_speed_and_faster_to
     assert ego(fast, "desired_speed") == ego(slow, "desired_speed") == 25.0
 
 
-def test_one_slower_sets_the_speed_one_step_below_and_it_stays():
-    env, td = alone("lane_speed", speed=23.0)
-    td = driven(env, step(env, td, SLOWER), KEEP, 20)
-    assert td[keys.EGO, "set_speed"] == 22.5
-    assert ego(td, "speed") == pytest.approx(22.5, abs=0.1)
-
-
 def test_without_commands_of_speed_an_episode_is_the_same_as_with_the_papers_actions():
-    rng = torch.Generator().manual_seed(0)
-    paper = environment(num_envs=16, seed=3)
-    more = environment(num_envs=16, seed=3, actions=ActionParameters("lane_speed"))
-    one, other = paper.reset(), more.reset()
-    for _ in range(8):
-        action = torch.randint(0, 3, (16,), generator=rng)
-        one, other = step(paper, one, action), step(more, other, action)
+    paper, more = (
+        run(environment(num_envs=16, seed=3, actions=ActionParameters(form)), 8, few_changes)
+        for form in ("lane", "lane_speed")
+    )
+    for one, other in zip(paper, more):
         assert same_bits(one[keys.VEHICLES], other[keys.VEHICLES]) == []
 
 
@@ -90,27 +74,6 @@ def test_the_speed_aimed_at_is_the_last_number_of_the_observation():
 # continuous
 
 
-@pytest.mark.parametrize(("pedal", "expected"), [(1.0, 3.0), (-1.0, -8.0), (0.0, 0.0)])
-def test_the_pedal_is_the_acceleration(pedal, expected):
-    env, td = alone("continuous", speed=20.0)
-    after = step(env, td, (pedal, 0.0))
-    assert ego(after, "speed") == pytest.approx(20.0 + expected)
-    assert after[keys.EGO, "mean_acceleration"].item() == pytest.approx(expected)
-
-
-def test_the_ego_gets_no_faster_than_desired_and_brakes_to_a_stop():
-    env, td = alone("continuous", speed=24.0)
-    assert ego(driven(env, td, (1.0, 0.0), 5), "speed") == pytest.approx(25.0)
-    assert ego(driven(env, td, (-1.0, 0.0), 5), "speed") == 0.0
-
-
-def test_who_does_not_brake_runs_into_the_car_ahead():
-    env, td = alone("continuous")
-    td = placed(env, vehicles({"x": 0.0}, {"x": 60.0, "speed": 0.0, "desired_speed": 0.001}))
-    assert driven(env, td, (0.0, 0.0), 10)[keys.EVENTS, "hard_crash"]
-    assert not driven(env, td, (-1.0, 0.0), 10)[keys.EVENTS, "hard_crash"]
-
-
 @pytest.mark.parametrize(("wheel", "y", "changes"), [(1.0, 4.0, 1), (0.25, 1.0, 0)])
 def test_a_wheel_of_one_leads_to_the_next_lane_and_less_to_a_line_within_the_lane(
     wheel, y, changes
@@ -124,24 +87,6 @@ def test_a_wheel_of_one_leads_to_the_next_lane_and_less_to_a_line_within_the_lan
     assert ego(td, "y") == pytest.approx(y, abs=0.05)
     assert td[keys.EGO, "lane_changes"] == changes
     assert td[keys.EGO, "change_direction"] == 0
-
-
-def test_whose_centre_crosses_the_edge_has_left_the_road():
-    env, td = alone("continuous")
-    td = driven(env, td, (0.0, -1.0), 10)
-    assert td[keys.EVENTS, "out_of_road"]
-    assert td["terminated"]
-    assert ego(td, "y") < -2.0
-
-
-def test_a_line_beside_which_there_is_no_lane_yet_must_not_be_crossed():
-    ramp = (LaneStretch(200.0, 400.0, WALL), LaneStretch())
-    env, td = alone("continuous", stretches=ramp, lanes=2)
-    assert driven(env, td, (0.0, 1.0), 10)[keys.EVENTS, "out_of_road"]
-    beside = placed(env, vehicles({"x": 210.0, "visibility": 1}, FAR))
-    beside = driven(env, beside, (0.0, 1.0), 3)
-    assert not beside[keys.EVENTS, "out_of_road"]
-    assert ego(beside, "y") > 2.0
 
 
 # In the libraries

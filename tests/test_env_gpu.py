@@ -1,11 +1,10 @@
 """A GPU, seen on a pretended one: where the tensors are, and for what the host waits."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from reference.processes import run
 from torch.utils import backend_registration
 
 PROGRAM = Path(__file__).parent / "reference" / "pretend_gpu.py"
@@ -39,8 +38,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def test_a_decision_of_all_traffics_and_a_training_stay_on_the_gpu_and_wait_for_what_is_listed():
-    command = [sys.executable, str(PROGRAM)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = run(str(PROGRAM))
     assert done.returncode == 0, done.stderr[-3000:]
     report = json.loads(done.stdout.splitlines()[-1])
     mixed = {"reset": RESET | ROWS, "decision": DECISION | ROWS, "elsewhere": []}

@@ -1,93 +1,72 @@
-"""Rule-driven traffic has no crashes of its own making.
+"""Traffic has no crashes of its own making.
 
 Alone, or with an ego that keeps its lane or signals.
 """
 
 import random
-from dataclasses import replace
+from dataclasses import asdict
 
 import pytest
 import torch
-from reference.worlds import environment
+from reference.traffics import all_faults, keep_lane
+from reference.worlds import random_environment
 
+import ganlane
 from ganlane import keys
 from ganlane.agents.drivers import KeepLaneDriver, MobilDriver
 from ganlane.settings.driving import Visibility
-from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.state import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 ROWS = 16
 
 
-def sparse(vehicles: int, lanes: int) -> SpawnParameters:
-    """Table II, its spread grown with the number of vehicles."""
-    return SpawnParameters(spread_m=max(200.0, 25.0 * (vehicles / lanes + 2)))
+class Watch:
+    """Looks at every physics step: nobody overlaps, leaves the road or drives backwards.
 
+    ``first`` is the first vehicle of a row that it looks at, 0 the ego; ``km`` is what the others
+    have driven.
+    """
 
-def dense(rng: random.Random, vehicles: int, lanes: int) -> SpawnParameters:
-    """Up to a jam: speeds no higher than what the smallest gap allows to brake from."""
-    spacing = rng.choice([6.0, 8.0, 12.0])
-    speeds = (0.0, min(rng.choice([1.0, 3.0, 8.0]), 1.2 * (spacing - 4.5)))
-    return SpawnParameters(
-        spread_m=vehicles / lanes * spacing * rng.uniform(1.1, 3.0) + spacing,
-        min_spacing_m=spacing,
-        front_speed_mps=speeds,
-        rear_speed_mps=speeds,
-        ego_speed_mps=speeds,
-    )
+    def __init__(self, road: Road, first: int = 0) -> None:
+        self.road = road
+        self.first = first
+        self.km = 0.0
 
-
-def crawling(p: SpawnParameters, rng: random.Random) -> SpawnParameters:
-    """Drivers of very different desired speeds: queues behind the slow ones."""
-    return replace(p, desired_speed_mps=(rng.choice([1.0, 5.0]), rng.choice([8.0, 36.0])))
+    def __call__(self, now: Vehicles, running: torch.Tensor) -> None:
+        now = now.part(running)
+        self.km += (now.speed * now.valid)[:, 1:].sum().item() * keys.PHYSICS_STEP_S / 1000.0
+        now = now.columns(slice(self.first, None))
+        assert not pair_overlaps(now).any()
+        assert (now.y >= self.road.right_edge_m()).all()
+        assert (now.y <= self.road.left_edge_m()).all()
+        assert (now.speed >= 0.0).all()
 
 
 def drive(rng: random.Random, most_vehicles: int, duration_s: float) -> float:
     """One random road with random traffic, ``ROWS`` episodes of it: the vehicle-km driven.
 
-    In a third of them it is alone, with no ego. Nobody overlaps, leaves the road or drives
-    backwards.
+    In a third of them it is alone, with no ego.
     """
-    lanes = rng.randint(1, 6)
-    vehicles = rng.randint(2, most_vehicles)
-    spawn = dense(rng, vehicles, lanes) if rng.random() < 0.5 else sparse(vehicles, lanes)
-    spawn = crawling(spawn, rng) if rng.random() < 0.4 else spawn
-    period_s = rng.choice([0.1, 0.2, 0.5, 1.0, 2.0])
-    env = environment(
-        lanes,
+    env = random_environment(
+        rng,
         ROWS,
-        vehicles,
-        mobil=rng.random() < 0.8,
-        period_s=period_s,
-        timeout_s=duration_s,
+        most_vehicles=most_vehicles,
+        spacings_m=(6.0, 8.0, 12.0, 25.0),
         visibility=Visibility.SIGNALLED,
-        spawn=spawn,
-        seed=rng.randrange(10**9),
-        dtype=torch.float32,
-        recycle=rng.random() < 0.5,
+        goal_m=5000.0,
+        timeout_s=duration_s,
         kernel="auto",
     )
     driver = (MobilDriver if rng.random() < 0.5 else KeepLaneDriver)(env.road)
-    km = 0.0
-
-    def record(now: Vehicles, running: torch.Tensor) -> None:
-        nonlocal km
-        driven = now.speed * (now.valid & running[:, None])
-        km += driven.sum().item() * keys.PHYSICS_STEP_S / 1000.0
-        assert not pair_overlaps(now)[running].any()
-        assert (now.y >= env.road.right_edge_m()).all()
-        assert (now.y <= env.road.left_edge_m()).all()
-        assert (now.speed >= 0.0).all()
-
-    env.recorder = record
+    env.recorder = watch = Watch(env.road)
     td = env.reset()
     td[keys.VEHICLES, "valid"][:, 0] = rng.random() > 1 / 3
-    for _ in range(round(duration_s / period_s)):
+    for _ in range(round(duration_s / env.episode.decision_period_s)):
         td = env.step(driver(td))["next"]
         assert not td[keys.EVENTS, "hard_crash"].any()
         assert not td[keys.EVENTS, "out_of_road"].any()
-    return km
+    return watch.km
 
 
 @pytest.mark.parametrize(
@@ -100,3 +79,40 @@ def test_no_overlap_in_so_many_km_on_so_many_roads(vehicle_km, roads, most_vehic
     while km < vehicle_km or roads > 0:
         km += drive(rng, most_vehicles, duration_s)
         roads -= 1
+
+
+LORRIES = {"truck_share": 0.4}
+#: The road stays full.
+RECYCLED = {"recycle": True}
+CROWD = {"vehicles": 14, "spread_m": 300.0}
+#: Ten times the default rates and more.
+FAULTS = {"name": "idm_faults", **asdict(all_faults(120.0, 0.5))}
+
+
+@pytest.mark.parametrize(
+    ("traffic", "rows", "options", "vehicle_km"),
+    [
+        ("idm", 32, LORRIES, 170.0),
+        ("idm_mobil", 32, LORRIES | RECYCLED, 170.0),
+        ("gan_calibrated", 8, LORRIES, 40.0),
+        ("idm_random", 64, CROWD, 500.0),
+        (FAULTS, 24, CROWD | RECYCLED, 100.0),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                ("idm", 64, LORRIES | RECYCLED, 1760.0),
+                ("idm_mobil", 64, LORRIES | RECYCLED, 1800.0),
+                ("gan_calibrated", 48, LORRIES | RECYCLED, 840.0),
+                ("idm_faults", 128, CROWD | RECYCLED, 5000.0),
+            )
+        ),
+    ],
+    ids=str,
+)
+def test_nobody_overlaps_another_or_an_ego_that_keeps_its_lane(traffic, rows, options, vehicle_km):
+    env = ganlane.make_env(traffic, rows, **options).base_env
+    # Drivers who make mistakes may run into the ego.
+    env.recorder = watch = Watch(env.road, first=1 if "faults" in str(traffic) else 0)
+    td = env.reset()
+    while watch.km < vehicle_km:
+        _, td = env.step_and_maybe_reset(td.set(keys.ACTION, keep_lane(td)))

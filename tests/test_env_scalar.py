@@ -7,94 +7,27 @@ import pytest
 import torch
 from reference import scalar
 from reference.worlds import (
-    DOUBLE,
-    disturbed,
+    KINDS,
+    disturbed_start,
     environment,
-    packed,
-    placed,
-    random_flow,
-    random_stretches,
+    random_actions,
+    random_environment,
     rules_of,
     scalar_state,
     step,
 )
 
 from ganlane import keys
+from ganlane.agents.drivers import MobilDriver
 from ganlane.env import HighwayEnv
-from ganlane.settings.actions import ActionParameters
 from ganlane.settings.episode import SpawnParameters
-from ganlane.sim.state import Vehicles
 
 CLOSE = {"rel": 0.0, "abs": 1e-6}
 MOTION = ("x", "y", "heading", "speed", "acceleration")
 
 
-def random_environment(rng: random.Random, rows: int, road: str, actions: str) -> HighwayEnv:
-    """1 to 6 lanes, 2 to 20 vehicles, sparse to dense, with and without MOBIL, all outcomes.
-
-    On a ``road`` that is no highway some lanes begin late and end at a wall, with ``flow`` vehicles
-    enter and leave.
-    """
-    lanes = rng.randint(1, 6)
-    vehicles = rng.randint(2, 20)
-    spacing = rng.choice([8.0, 12.0, 25.0])
-    spread = max(60.0, 1.5 * spacing * vehicles / lanes + spacing)
-    stretches = random_stretches(lanes, rng) if road != "highway" else ()
-    return environment(
-        lanes,
-        rows,
-        vehicles,
-        mobil=rng.random() < 0.75,
-        period_s=rng.choice([0.3, 0.5, 1.0, 1.0, 2.0]),
-        goal_m=rng.choice([20.0, 60.0, 5000.0, 5000.0]),
-        timeout_s=rng.choice([2.5, 1000.0, 1000.0]),
-        abort=rng.random() < 0.3,
-        spawn=packed(spread, spacing),
-        seed=rng.randrange(10**9),
-        stretches=stretches,
-        flow=random_flow(stretches, rng) if road == "flow" else None,
-        actions=ActionParameters(actions),
-    )
-
-
-def disturb(env: HighwayEnv, td, generator: torch.Generator):
-    """A state in which the wheels are turned and some, the ego included, are in the middle of a
-    change.
-    """
-    start = Vehicles.of(td[keys.VEHICLES])
-    td = placed(env, disturbed(start, env.road.lanes, generator))
-    td[keys.TRAFFIC, "steering"] = 0.02 * torch.randn(
-        start.x.shape, dtype=DOUBLE, generator=generator
-    )
-    td[keys.EGO, "change_direction"] = (td[keys.VEHICLES, "target_lane"] - start.target_lane)[:, 0]
-    return td
-
-
-def any_action(rng: random.Random, state: scalar.State, lanes: int) -> int:
-    return rng.choice((0, 0, 1, 2))
-
-
-def any_speed(rng: random.Random, state: scalar.State, lanes: int) -> int:
-    return rng.choice((0, 3, 3, 4, 4, 4, 1, 2) if rng.random() < 0.2 else (0, 3, 4))
-
-
-def any_controls(rng: random.Random, state: scalar.State, lanes: int) -> tuple[float, float]:
-    wheel = rng.choice((0.0, 0.0, 0.4, -0.4, 1.0, -1.0)) + rng.uniform(-0.1, 0.1)
-    return rng.uniform(-0.6, 1.0), max(-1.0, min(1.0, wheel))
-
-
-def stay_on_the_road(rng: random.Random, state: scalar.State, lanes: int) -> int:
-    lane = state.cars[0].target_lane
-    return rng.choice([0] * 20 + [1] * (lane < lanes - 1) + [2] * (lane > 0))
-
-
-CHOICES = {"lane": any_action, "lane_speed": any_speed, "continuous": any_controls}
-
-
-def compare(
-    env: HighwayEnv, td, duration_s: float, rng: random.Random, choose=any_action
-) -> set[str]:
-    """Drive both simulators with the same random actions; compare states, events and memories.
+def compare(env: HighwayEnv, td, duration_s: float, act) -> set[str]:
+    """Drive both simulators with the actions ``act(td)``; compare states, events and memories.
 
     Which ends and soft crashes there were, and whether anybody entered or left.
     """
@@ -104,12 +37,12 @@ def compare(
     states = [scalar_state(td, row, env) for row in range(rows)]
     running = [True] * rows
     for _ in range(round(duration_s / env.episode.decision_period_s)):
-        actions = [choose(rng, state, rules.lanes) for state in states]
+        actions = act(td)
         td = step(env, td, actions)
         for row in range(rows):
             if running[row]:
                 before = [car.valid for car in states[row].cars]
-                outcome = scalar.decide(states[row], actions[row], rules)
+                outcome = scalar.decide(states[row], actions[row].tolist(), rules)
                 pairs = zip(before, states[row].cars)
                 seen |= {
                     "entered" if car.valid else "left" for was, car in pairs if was != car.valid
@@ -149,10 +82,6 @@ def assert_same(td, row: int, state: scalar.State, outcome: scalar.Outcome) -> N
     assert {key: td[key][row].item() for key in expected} == pytest.approx(expected, **CLOSE)
 
 
-#: Roads, and what the ego chooses among.
-KINDS = [(road, form) for road in ("highway", "lanes that end", "flow") for form in CHOICES]
-
-
 def compare_random_scenes(
     kinds: Sequence[tuple[str, str]], roads: int, rows: int, duration_s: float
 ) -> set[str]:
@@ -162,11 +91,9 @@ def compare_random_scenes(
     seen = set()
     for number in range(roads):
         road, form = kinds[number % len(kinds)]
-        env = random_environment(rng, rows, road, form)
-        td = env.reset()
-        if number % 2:
-            td = disturb(env, td, generator)
-        seen |= compare(env, td, duration_s, rng, CHOICES[form])
+        env = random_environment(rng, rows, road, form, dtype=torch.float64, recycle=False)
+        td = disturbed_start(env, generator) if number % 2 else env.reset()
+        seen |= compare(env, td, duration_s, lambda td, env=env: random_actions(env, generator))
     return seen
 
 
@@ -183,10 +110,16 @@ def test_and_on_2000_of_each_kind(kind):
     compare_random_scenes([kind], roads=500, rows=4, duration_s=10.0)
 
 
+def by_mobil(env: HighwayEnv):
+    """Changes lanes where it is of use, and stays on the road."""
+    driver = MobilDriver(env.road)
+    return lambda td: driver(td)["action"]
+
+
 def test_on_a_ring_they_agree_too():
     spawn = SpawnParameters(spread_m=170.0, min_spacing_m=20.0)
     env = environment(lanes=2, num_envs=3, vehicles=12, ring_m=200.0, spawn=spawn, seed=8)
-    compare(env, env.reset(), duration_s=10.0, rng=random.Random(4), choose=stay_on_the_road)
+    compare(env, env.reset(), duration_s=10.0, act=by_mobil(env))
 
 
 @pytest.mark.parametrize(
@@ -195,6 +128,4 @@ def test_on_a_ring_they_agree_too():
 @pytest.mark.parametrize("mobil", [True, False])
 def test_whole_episodes_agree_to_their_end(mobil, rows, goal_m):
     env = environment(num_envs=rows, mobil=mobil, goal_m=goal_m, first_episode=1000 * mobil)
-    rng = random.Random(rows)
-    seen = compare(env, env.reset(), duration_s=1000.0, rng=rng, choose=stay_on_the_road)
-    assert "goal" in seen
+    assert "goal" in compare(env, env.reset(), duration_s=1000.0, act=by_mobil(env))

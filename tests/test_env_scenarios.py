@@ -5,7 +5,7 @@ Cut-in, stalled car, blocked lane, stop-and-go, dense traffic.
 
 import pytest
 import torch
-from reference.foreign import overlaps
+from reference import traffics
 
 import ganlane
 from ganlane import keys
@@ -18,20 +18,13 @@ ROWS = 6
 
 
 def drive(scene: str | dict, driver: str, traffic: str, seconds: int) -> Vehicles:
-    """Every physics step [T, N, M] of ``ROWS`` episodes side by side, without a goal, until one of
-    them ends; nobody is touched.
+    """The start and every physics step [T + 1, N, M] of ``ROWS`` episodes side by side, without a
+    goal; nobody is touched.
     """
-    env = ganlane.make_env(traffic, ROWS, env=scene, goal_m=1e5)
+    env = ganlane.make_env(traffic, ROWS, env=scene, goal_m=1e5).base_env
     policy = ganlane.load_agent(driver, env=scene).policy
-    frames: list[Vehicles] = []
-    env.base_env.recorder = lambda vehicles, running: frames.append(vehicles)
-    td = env.reset()
-    for _ in range(seconds):
-        td = env.step(policy(td))["next"]
-        if td["done"].any():
-            break
-    film = Vehicles(*(torch.stack(fields) for fields in zip(*frames)))
-    assert overlaps(film) == 0
+    film, _, _ = traffics.drive(env, range(ROWS), seconds, lambda td: policy(td)["action"])
+    assert traffics.overlaps(film) == 0
     return film
 
 

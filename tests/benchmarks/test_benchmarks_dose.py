@@ -2,7 +2,6 @@
 
 import polars as pl
 import pytest
-from reference.processes import ROOT
 from reference.refusals import user_error
 
 from benchmarks import dose

@@ -7,8 +7,8 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 import torch
-from reference.kernels import MIXED, RUNNABLE, apart, kernel_of, random_environment
-from reference.worlds import environment, leaves, same_bits
+from reference.kernels import MIXED, RUNNABLE, apart, kernel_of
+from reference.worlds import environment, leaves, random_environment, same_bits
 
 from ganlane import keys
 from ganlane.api import make_env
@@ -60,7 +60,8 @@ def random_highway(rng, traffic, rows):
     """1 to 5 lanes with up to 25 vehicles."""
     config = EnvConfig(lanes=rng.randint(1, 5))
     module = make_traffic(make(TrafficConfig, traffic), config)
-    return random_environment(rng, config.lanes, rows, 25, [12.0, 25.0], traffic=module)
+    size = {"most_vehicles": 25, "spacings_m": (12.0, 25.0), "lanes": config.lanes}
+    return random_environment(rng, rows, **size, traffic=module, recycle=False)
 
 
 def decide_side_by_side(env, actions):

@@ -102,14 +102,11 @@ def to(self: nn.Module, *arguments: Any, **named: Any) -> nn.Module:
     """``nn.Module.to``, which cannot move such tensors."""
     device, dtype, *_ = torch._C._nn._parse_to(*arguments, **named)
     for module in self.modules():
-        for name, parameter in module._parameters.items():
-            if parameter is not None:
-                moved = torch.empty_like(parameter, device=device, dtype=dtype)
-                module._parameters[name] = nn.Parameter(moved)
-        for name, buffer in module._buffers.items():
-            if buffer is not None:
-                kind = dtype if buffer.is_floating_point() else None
-                module._buffers[name] = torch.empty_like(buffer, device=device, dtype=kind)
+        tensors = [*module.named_parameters(recurse=False), *module.named_buffers(recurse=False)]
+        for name, tensor in tensors:
+            kind = dtype if tensor.is_floating_point() else None
+            moved = torch.empty_like(tensor, device=device, dtype=kind)
+            setattr(module, name, nn.Parameter(moved) if name in module._parameters else moved)
     return self
 
 

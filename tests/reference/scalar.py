@@ -11,16 +11,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+
+from ganlane.settings.road import LaneStretch
 
 DT = 0.1
 REST = 1e-12  # a heading, steering angle or lateral position of at most this is 0
 WHEELBASE = 2.7
 NOBODY = 10_000.0  # Table V: the gap of an empty lane
+LANE_WIDTH = 4.0
 CENTRE = 0
-BODY = 1
 SIGNALLED = 2
-KEEP = 0
 LEFT = 1
 RIGHT = 2
 FASTER = 3
@@ -44,20 +44,11 @@ class Car:
     exits: bool = False
 
 
-class Stretch(NamedTuple):
-    """Where a lane begins and ends, m, and in what: a wall, an exit or nothing."""
-
-    begin: float = -math.inf
-    end: float = math.inf
-    kind: str = "nothing"
-
-
 @dataclass(frozen=True)
 class Rules:
     """What of a run can be chosen."""
 
     lanes: int
-    lane_width: float = 4.0
     mobil: bool = True
     abort: bool = False
     substeps: int = 10
@@ -65,7 +56,7 @@ class Rules:
     timeout_steps: int = 10_000
     ring: float | None = None
     # of every lane; none: all go on
-    stretches: tuple[Stretch, ...] = ()
+    stretches: tuple[LaneStretch, ...] = ()
     # what the ego is commanded: lane, lane_speed or continuous
     actions: str = "lane"
     flow: Flow | None = None
@@ -73,11 +64,11 @@ class Rules:
     @cached_property
     def exit_lane(self) -> int | None:
         """The lane that ends in an exit."""
-        exits = [lane for lane, stretch in enumerate(self.stretches) if stretch.kind == "exit"]
+        exits = [lane for lane, stretch in enumerate(self.stretches) if stretch.end == "exit"]
         return exits[0] if exits else None
 
-    def stretch(self, lane: int) -> Stretch:
-        return self.stretches[lane] if self.stretches else Stretch()
+    def stretch(self, lane: int) -> LaneStretch:
+        return self.stretches[lane] if self.stretches else LaneStretch()
 
 
 @dataclass(frozen=True)
@@ -148,8 +139,15 @@ def lanes_entered(car: Car, rules: Rules) -> set[int]:
     half = 0.5 * (car.width * math.cos(car.heading) + car.length * abs(math.sin(car.heading)))
     right = car.y - half + 0.1
     left = car.y + half - 0.1
-    w = rules.lane_width
-    return {k for k in range(rules.lanes) if right < (k + 0.5) * w and left > (k - 0.5) * w}
+    return {
+        k
+        for k in range(rules.lanes)
+        if right < (k + 0.5) * LANE_WIDTH and left > (k - 0.5) * LANE_WIDTH
+    }
+
+
+def nearest_lane(car: Car, rules: Rules) -> int:
+    return min(rules.lanes - 1, max(0, round(car.y / LANE_WIDTH)))
 
 
 def lanes_seen_in(car: Car, rules: Rules) -> set[int]:
@@ -157,7 +155,7 @@ def lanes_seen_in(car: Car, rules: Rules) -> set[int]:
     if not car.valid:
         return set()
     if car.visibility == CENTRE:
-        return {min(rules.lanes - 1, max(0, round(car.y / rules.lane_width)))}
+        return {nearest_lane(car, rules)}
     entered = lanes_entered(car, rules)
     return entered | {car.target_lane} if car.visibility == SIGNALLED else entered
 
@@ -277,9 +275,9 @@ def front(car: Car) -> float:
 def before_wall(car: Car, lane: int, rules: Rules, margin: float) -> float:
     """IDM behind a standing obstacle ``margin`` m before the lane's wall; infinite without one."""
     stretch = rules.stretch(lane)
-    if stretch.kind != "wall":
+    if stretch.end != "wall":
         return math.inf
-    gap = stretch.end - margin - front(car)
+    gap = stretch.end_m - margin - front(car)
     return idm(car.speed, car.desired_speed, gap, 0.0)
 
 
@@ -287,7 +285,7 @@ def there_is(lane: int, x: float, rules: Rules) -> bool:
     """Whether the road has the lane at x."""
     if not 0 <= lane < rules.lanes:
         return False
-    return rules.stretch(lane).begin <= x < rules.stretch(lane).end
+    return rules.stretch(lane).begin_m <= x < rules.stretch(lane).end_m
 
 
 def urge(car: Car, lane: int, rules: Rules) -> float:
@@ -296,10 +294,10 @@ def urge(car: Car, lane: int, rules: Rules) -> float:
     """
     if car.exits and rules.exit_lane is not None:
         ways_out = [rules.exit_lane]
-        end = rules.stretch(rules.exit_lane).end
+        end = rules.stretch(rules.exit_lane).end_m
     else:
-        ways_out = [k for k in range(rules.lanes) if rules.stretch(k).kind == "nothing"]
-        end = rules.stretch(lane).end
+        ways_out = [k for k in range(rules.lanes) if rules.stretch(k).end == "nothing"]
+        end = rules.stretch(lane).end_m
     changes = min(abs(k - lane) for k in ways_out)
     if changes == 0:
         return 0.0
@@ -326,16 +324,12 @@ def asked(car: Car, rules: Rules) -> int | None:
     return lane if here > 0.577 * 8.0 else None
 
 
-def nearest_lane(car: Car, rules: Rules) -> int:
-    return min(rules.lanes - 1, max(0, round(car.y / rules.lane_width)))
-
-
 def arrival(ego: Car, rules: Rules) -> str:
     """``goal``, ``missed_exit`` where there is an exit, or nothing yet."""
     way_out = rules.exit_lane
     if way_out is None:
         return "goal" if ego.x >= rules.goal else ""
-    if ego.x < rules.stretch(way_out).end:
+    if ego.x < rules.stretch(way_out).end_m:
         return ""
     return "goal" if nearest_lane(ego, rules) == way_out else "missed_exit"
 
@@ -343,14 +337,14 @@ def arrival(ego: Car, rules: Rules) -> str:
 def in_the_wall(car: Car, rules: Rules) -> bool:
     """Whether its body is in a lane whose wall its front has passed."""
     walls = [rules.stretch(lane) for lane in lanes_entered(car, rules)]
-    return any(wall.kind == "wall" and front(car) > wall.end for wall in walls)
+    return any(wall.end == "wall" and front(car) > wall.end_m for wall in walls)
 
 
 # Across the road: MOBIL, Table IV
 
 
-def settled(car: Car, rules: Rules) -> bool:
-    return abs(car.y - car.target_lane * rules.lane_width) < 0.3
+def settled(car: Car) -> bool:
+    return abs(car.y - car.target_lane * LANE_WIDTH) < 0.3
 
 
 def incentive(view: View, i: int, lane: int) -> tuple[float, bool]:
@@ -378,7 +372,7 @@ def mobil_wish(view: View, i: int) -> int:
     """-1, 0 or +1 lanes; the better side, left at a tie; nothing in the middle of a change."""
     car = view.cars[i]
     rules = view.rules
-    if not car.valid or not settled(car, rules):
+    if not car.valid or not settled(car):
         return 0
     best = -math.inf
     wish = 0
@@ -466,12 +460,8 @@ def corners(car: Car) -> list[tuple[float, float]]:
 def overlap(one: Car, other: Car) -> bool:
     """Whether no line parallel to an edge separates the two boxes."""
     boxes = corners(one), corners(other)
-    for angle in (
-        one.heading,
-        one.heading + math.pi / 2,
-        other.heading,
-        other.heading + math.pi / 2,
-    ):
+    edges = [car.heading + turn for car in (one, other) for turn in (0.0, math.pi / 2)]
+    for angle in edges:
         c = math.cos(angle)
         s = math.sin(angle)
         shadows = [[c * x + s * y for x, y in box] for box in boxes]
@@ -508,7 +498,7 @@ def physics_step(state: State, rules: Rules) -> None:
     if rules.mobil and state.step % 10 == 0:
         for i, change in mobil_changes(view).items():
             state.cars[i] = replace(state.cars[i], target_lane=state.cars[i].target_lane + change)
-    lines = [car.target_lane * rules.lane_width for car in state.cars]
+    lines = [car.target_lane * LANE_WIDTH for car in state.cars]
     if state.line is not None and state.throttle is not None:
         lines[0] = state.line
         accelerations[0] = state.throttle
@@ -528,7 +518,7 @@ def obey(state: State, action: int, rules: Rules) -> tuple[bool, bool]:
     target = ego.target_lane + wish
     if not (there_is(target, ego.x, rules) and there_is(ego.target_lane, ego.x, rules)):
         return False, True
-    state.cars[0] = replace(state.cars[0], target_lane=target)
+    state.cars[0] = replace(ego, target_lane=target)
     state.direction = wish
     state.lane_changes += 1
     return True, False
@@ -541,10 +531,14 @@ def crossing_allowed(lane: int, other: int, x: float, rules: Rules) -> bool:
 
 
 def be_steered(state: State, pedal: float, wheel: float, rules: Rules) -> bool:
-    """Acceleration and line of this decision; whether the lane aimed at becomes another one."""
+    """Acceleration and line of this decision; whether the lane aimed at becomes another one.
+
+    Numbers beyond -1 and 1 count as these.
+    """
     ego = state.cars[0]
-    lane = min(rules.lanes - 1, max(0, round(ego.y / rules.lane_width)))
-    state.line = (lane + wheel) * rules.lane_width
+    pedal, wheel = (max(-1.0, min(1.0, number)) for number in (pedal, wheel))
+    lane = nearest_lane(ego, rules)
+    state.line = (lane + wheel) * LANE_WIDTH
     target = lane + (wheel > 0.5) - (wheel < -0.5)
     if not crossing_allowed(lane, target, ego.x, rules):
         target = lane
@@ -599,7 +593,7 @@ def let_in_and_out(state: State, rules: Rules) -> None:
     way_out = rules.exit_lane
     for number, car in enumerate(state.cars):
         by_exit = way_out is not None and nearest_lane(car, rules) == way_out
-        past = by_exit and car.x >= rules.stretch(way_out).end
+        past = by_exit and car.x >= rules.stretch(way_out).end_m
         if number and (past or car.x > flow.end):
             state.cars[number] = replace(car, valid=False)
     for lane, probability in enumerate(flow.arrivals):
@@ -608,27 +602,27 @@ def let_in_and_out(state: State, rules: Rules) -> None:
             continue
         numbers = {}
         for slot, car in enumerate(state.cars):
-            if slot and not car.valid and settled(car, rules):
+            if slot and not car.valid and settled(car):
                 differs = way_out is not None and car.exits != (leaves < flow.exit_share)
                 numbers[slot] = (differs, drawn(state.key, state.step, slot, 94))
         if not numbers:
             continue
         slot = min(numbers, key=numbers.__getitem__)
         car = state.cars[slot]
-        y = car.y + (lane - car.target_lane) * rules.lane_width
+        y = car.y + (lane - car.target_lane) * LANE_WIDTH
         newcomer = replace(car, x=flow.start, y=y, target_lane=lane)
         if may_enter(newcomer, slot, state, rules):
             state.cars[slot] = replace(newcomer, valid=True)
 
 
-def decide(state: State, action: int | tuple[float, float], rules: Rules) -> Outcome:
+def decide(state: State, action: int | list[float], rules: Rules) -> Outcome:
     """One decision, in place; a state that has ended stays as it was at that instant."""
     outcome = Outcome()
     start_speed = state.cars[0].speed
     start_step = state.step
     off_road = False
     desired = state.cars[0].desired_speed
-    if isinstance(action, tuple):
+    if rules.actions == "continuous":
         outcome.started_change = be_steered(state, *action, rules)
     else:
         outcome.started_change, off_road = obey(state, action, rules)
@@ -641,10 +635,10 @@ def decide(state: State, action: int | tuple[float, float], rules: Rules) -> Out
     for _ in range(rules.substeps):
         if outcome.reasons:
             break
-        lane = round(state.cars[0].y / rules.lane_width)
+        lane = round(state.cars[0].y / LANE_WIDTH)
         physics_step(state, rules)
         ego = state.cars[0]
-        left = not crossing_allowed(lane, round(ego.y / rules.lane_width), ego.x, rules)
+        left = not crossing_allowed(lane, round(ego.y / LANE_WIDTH), ego.x, rules)
         ahead, behind = ego_close(View(state.cars, rules))
         outcome.soft_crash += ahead and not state.close_ahead
         outcome.soft_crash_behind += behind and not state.close_behind
@@ -660,12 +654,12 @@ def decide(state: State, action: int | tuple[float, float], rules: Rules) -> Out
         elif state.step >= rules.timeout_steps:
             outcome.reasons.append("timeout")
     state.cars[0] = ego = replace(state.cars[0], desired_speed=desired)
-    if settled(ego, rules):
+    if settled(ego):
         state.direction = 0
     if state.step > start_step:
         outcome.mean_acceleration = (ego.speed - start_speed) / ((state.step - start_step) * DT)
     if state.direction:
-        remaining = abs(ego.y - ego.target_lane * rules.lane_width) / rules.lane_width
+        remaining = abs(ego.y - ego.target_lane * LANE_WIDTH) / LANE_WIDTH
         outcome.progress = min(1.0, max(0.0, 1.0 - remaining))
     if rules.flow is not None and not outcome.reasons:
         let_in_and_out(state, rules)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -53,32 +52,38 @@ def instability(speed: float, desired: float) -> float:
     return -f.gap / (f.speed + f.leader) - 0.5 * (f.leader - f.speed)
 
 
-def zero_of(function: Callable[[float], float], low: float, high: float) -> float:
-    """Where a function that is positive at ``low`` and negative at ``high`` changes sign."""
-    assert function(low) > 0.0 > function(high)
+def critical_speed(desired: float) -> float:
+    """m/s; string-unstable below (down to a crawl), stable above."""
+    low, high = 0.5 * desired, 0.99 * desired
+    assert instability(low, desired) > 0.0 > instability(high, desired)
     for _ in range(60):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if function(middle) > 0.0 else (low, middle)
+        low, high = (middle, high) if instability(middle, desired) > 0.0 else (low, middle)
     return low
 
 
-def critical_speed(desired: float) -> float:
-    """m/s; string-unstable below (down to a crawl), stable above."""
-    return zero_of(lambda v: instability(v, desired), 0.5 * desired, 0.99 * desired)
+def step_matrix(speed: float, desired: float, ahead: np.ndarray, dt: float) -> np.ndarray:
+    """One step of (displacements, speeds): ``v' = v + a dt``, ``x' = x + (v + v') dt / 2``.
+
+    ``ahead`` gives each of them its leader: a permutation of the cars on a ring, the phase ``e`` of
+    a wave.
+    """
+    f = slopes(speed, desired)
+    one = np.eye(len(ahead))
+    by_x = f.gap * (ahead - one)
+    by_v = f.speed * one + f.leader * ahead
+    return np.block(
+        [[one + 0.5 * dt**2 * by_x, dt * one + 0.5 * dt**2 * by_v], [dt * by_x, one + dt * by_v]]
+    )
 
 
 def wave(speed: float, desired: float, k: float, dt: float) -> tuple[complex, complex]:
-    """Factor z per step of the slowest-decaying wave, and speed over displacement (1/s) in it.
-
-    A step is ``v' = v + a dt``, ``x' = x + (v + v') dt / 2``; with ``x' = z x`` follows
-    ``2 (z - 1)^2 = dt^2 f_s (e - 1) (z + 1) + 2 dt (f_v + f_l e) (z - 1)``.
-    """
-    f = slopes(speed, desired)
-    e = cmath.exp(-1j * k)
-    stiff = f.gap * (e - 1.0) * dt * dt
-    damp = (f.speed + f.leader * e) * dt
-    z = max((1.0 + root for root in np.roots([2.0, -2.0 * damp - stiff, -2.0 * stiff])), key=abs)
-    return complex(z), complex(2.0 * (z - 1.0) / (dt * (z + 1.0)))
+    """Factor z per step of the slowest-decaying wave, and speed over displacement (1/s) in it."""
+    phase = np.array([[cmath.exp(-1j * k)]])
+    factors, shapes = np.linalg.eig(step_matrix(speed, desired, phase, dt))
+    slowest = np.abs(factors).argmax()
+    displacement, its_speed = shapes[:, slowest]
+    return complex(factors[slowest]), complex(its_speed / displacement)
 
 
 def growth_rate(speed: float, desired: float, cars: int, dt: float) -> tuple[float, int]:
@@ -88,19 +93,3 @@ def growth_rate(speed: float, desired: float, cars: int, dt: float) -> tuple[flo
         for j in range(1, cars // 2)
     ]
     return max(rates)
-
-
-def step_matrix(speed: float, desired: float, cars: int, dt: float, ring: bool) -> np.ndarray:
-    """One step of (displacements, speeds) [2 cars].
-
-    The first follows the last on a ring, else an undisturbed one.
-    """
-    f = slopes(speed, desired)
-    one = np.eye(cars)
-    ahead = np.eye(cars, k=-1)
-    ahead[0, -1] = float(ring)
-    by_x = f.gap * (ahead - one)
-    by_v = f.speed * one + f.leader * ahead
-    return np.block(
-        [[one + 0.5 * dt**2 * by_x, dt * one + 0.5 * dt**2 * by_v], [dt * by_x, one + dt * by_v]]
-    )

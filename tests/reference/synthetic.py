@@ -46,6 +46,20 @@ def synthetic_scenes(seed: int = 0, **size: float) -> pl.DataFrame:
     return sort(pl.concat(_scene(traffic, number, seed) for number in range(traffic.scenes)))
 
 
+def varied_scenes(count: int) -> pl.DataFrame:
+    """The scenes ``scene-0``, ``scene-1`` and so on, of 2, 3 and 4 lanes in turn, each a second
+    shorter than the one before.
+
+    The first lasts 9 s; every third driver leaves at 4.5 s.
+    """
+    scenes = []
+    for k in range(count):
+        scene = _scene(SyntheticTraffic(lanes=2 + k % 3, seconds=9.0 - k), number=k, seed=0)
+        stays = (pl.col("vehicle") % 3 > 0) | (pl.col("frame") <= 45)
+        scenes.append(scene.filter(stays).with_columns(scene=pl.lit(f"scene-{k}")))
+    return sort(pl.concat(scenes))
+
+
 def _scene(traffic: SyntheticTraffic, number: int, seed: int) -> pl.DataFrame:
     """One scene; every vehicle is present in every frame."""
     # Each scene has a seed of its own: their number changes none of them.

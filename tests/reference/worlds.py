@@ -6,15 +6,17 @@ Vehicles placed by hand, environments in one line, states turned into scalar car
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from reference import scalar
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 from ganlane import keys
 from ganlane.env import EpisodeParameters, HighwayEnv
+from ganlane.settings.actions import ActionParameters
 from ganlane.settings.driving import EgoParameters, Visibility
 from ganlane.settings.episode import SpawnParameters
 from ganlane.settings.road import EXIT, FAR_M, NOTHING, WALL, FlowParameters, LaneStretch, Stretches
@@ -55,11 +57,6 @@ def field_of(car: dict, name: str) -> float:
     """What a car says of itself, or else its lane, or else :data:`DEFAULTS`."""
     lane = car.get("lane", 0)
     return {**DEFAULTS, "y": 4.0 * lane, "target_lane": lane, **car}[name]
-
-
-def rows_of(scene: Vehicles, rows: slice | Sequence[int] | torch.Tensor) -> Vehicles:
-    """Some rows of a scene."""
-    return Vehicles(*(field[rows] for field in scene))
 
 
 def episode_keys(episodes: Sequence[int], stream: int = 0, seed: int = 0) -> torch.Tensor:
@@ -106,39 +103,44 @@ def random_scenes(rows: int, cars: int, lanes: int, seed: int) -> Vehicles:
     return vehicles_at(x, target, y=y, speed=speed, desired_speed=desired)
 
 
-def moves(
+Change = Callable[[Vehicles, Vehicles], Vehicles]
+
+
+def course(
     traffic: TrafficModule,
     cars: Vehicles,
     steps: int,
-    change: Callable[[Vehicles, Vehicles], Vehicles] = lambda before, after: after,
-) -> Iterator[Vehicles]:
-    """The cars after each physics step of rule-driven traffic, and what ``change`` makes of it."""
-    clock = torch.zeros(cars.x.shape[0], dtype=torch.int64)
-    memory = traffic.fresh_memory(cars, clock)
-    for _ in range(steps):
-        after, memory = traffic.move(cars, memory, clock, clock)
-        cars = change(cars, after)
-        yield cars
-
-
-def disturbed(scene: Vehicles, lanes: int, generator: torch.Generator) -> Vehicles:
-    """The scene with everything a little off.
-
-    In mid-change, at odd angles, seen in all ways or not at all.
+    change: Change = lambda before, after: after,
+) -> Iterator[tuple[Vehicles, TensorDictBase]]:
+    """The cars of episodes 0 to N - 1 after each physics step, or what ``change`` makes of them,
+    and the traffic's memory.
     """
-    between = drawing(scene.x.shape, generator, scene.x.dtype)
-    side = (between(0, 1) < 0.3) * (between(0, 2).long() * 2 - 1)
-    return scene.with_(
-        y=scene.y + between(-0.5, 0.5) + 0.5 * side * between(0, 4),
-        heading=between(-0.03, 0.03),
-        speed=between(0, 30) * (between(0, 1) < 0.9),
-        length=between(4, 6),
-        width=between(1.8, 2.6),
-        desired_speed=between(15, 35),
-        target_lane=(scene.target_lane + side).clamp(0, lanes - 1),
-        visibility=between(0, 3).long(),
-        valid=(between(0, 1) < 0.9) | (torch.arange(scene.x.shape[1]) == 0),
-    )
+    key = episode_keys(range(len(cars.x)))
+    memory = traffic.init_memory(cars, key)
+    for step in range(steps):
+        state = TensorDict(
+            {
+                keys.VEHICLES: cars.as_dict(),
+                keys.TRAFFIC: memory,
+                keys.EPISODE_KEY: key,
+                keys.STEP: torch.full_like(key, step),
+            },
+            key.shape,
+        )
+        after = traffic(state)
+        cars = change(cars, Vehicles.of(after[keys.MOVED]))
+        memory = after[keys.TRAFFIC]
+        yield cars, memory
+
+
+def moves(*arguments: Any) -> Iterator[Vehicles]:
+    """The cars of :func:`course`."""
+    return (cars for cars, _ in course(*arguments))
+
+
+def film_of(frames: Iterable[Vehicles]) -> Vehicles:
+    """Frames [N, M] one after the other, [T, N, M]."""
+    return Vehicles(*(torch.stack(fields) for fields in zip(*frames)))
 
 
 def packed(spread_m: float, spacing_m: float) -> SpawnParameters:
@@ -202,9 +204,7 @@ def rules_of(env: HighwayEnv) -> scalar.Rules:
         goal=env.episode.goal_m,
         timeout_steps=round(env.episode.timeout_s / 0.1),
         ring=env.road.ring_m,
-        stretches=tuple(
-            scalar.Stretch(its.begin_m, its.end_m, its.end) for its in env.road.stretches
-        ),
+        stretches=env.road.stretches,
         actions=env.actions.form,
         flow=flow,
     )
@@ -230,21 +230,32 @@ def step(
     return env.step(td)["next"]
 
 
+def run(
+    env: HighwayEnv,
+    decisions: int,
+    act: Callable[[TensorDictBase], Any] = lambda td: keys.KEEP,
+    start: TensorDictBase | None = None,
+) -> list[TensorDictBase]:
+    """The first state, of a reset unless told otherwise, and those after each decision, without
+    resets.
+    """
+    states = [env.reset() if start is None else start]
+    for _ in range(decisions):
+        states.append(step(env, states[-1], act(states[-1])))
+    return states
+
+
 def scalar_cars(scene: Vehicles, row: int) -> list[scalar.Car]:
     """One row of a scene, with straight wheels."""
     return [scalar.Car(*numbers) for numbers in zip(*(field[row].tolist() for field in scene))]
 
 
 def scalar_state(td: TensorDictBase, row: int, env: HighwayEnv) -> scalar.State:
-    """Row ``row`` of an environment's state as scalar cars.
-
-    Wheels are straight in traffic that has none.
-    """
+    """Row ``row`` of an environment's state as scalar cars."""
     cars = scalar_cars(Vehicles.of(td[keys.VEHICLES]), row)
-    wheels = td.get((keys.TRAFFIC, "steering"), None)
     flow = env.road.flow
     for i, car in enumerate(cars):
-        car.steering = 0.0 if wheels is None else wheels[row, i].item()
+        car.steering = td[keys.TRAFFIC, "steering"][row, i].item()
         car.exits = flow is not None and flow.exits(len(cars))[i]
     ego = {name: value[row].item() for name, value in td[keys.EGO].items()}
     cars[0].steering = ego["steering"]
@@ -342,6 +353,100 @@ def random_stretches(lanes: int, rng: random.Random) -> Stretches:
         end_m = rng.choice([rng.uniform(5.0, 40.0), rng.uniform(60.0, 350.0)])
         stretches.append(LaneStretch(begin_m, end_m, EXIT if lane == exit_lane else WALL))
     return tuple(stretches)
+
+
+#: Roads, and the forms of the ego's actions.
+KINDS = [
+    (road, form)
+    for road in ("highway", "lanes that end", "flow")
+    for form in ("lane", "lane_speed", "continuous")
+]
+
+
+def random_environment(
+    rng: random.Random,
+    rows: int,
+    road: str = "highway",
+    form: str = "lane",
+    most_vehicles: int = 20,
+    spacings_m: Sequence[float] = (8.0, 12.0, 25.0),
+    lanes: int | None = None,
+    **others: object,
+) -> HighwayEnv:
+    """Tensor code on 1 to 6 lanes with 2 to ``most_vehicles``, dense and sparse, in float32.
+
+    All periods and visibilities, with and without MOBIL and drivers who crawl. On a ``road`` of
+    "lanes that end" some begin late and end at a wall; where there is a "flow", vehicles enter and
+    leave, too. ``form``: of the actions; ``others`` are arguments of :func:`environment`.
+    """
+    lanes = lanes or rng.randint(1, 6)
+    vehicles = rng.randint(2, most_vehicles)
+    spacing_m = rng.choice(spacings_m)
+    spawn = packed(max(60.0, 1.5 * spacing_m * vehicles / lanes + spacing_m), spacing_m)
+    if rng.random() < 0.3:
+        crawl = rng.choice([1.0, 5.0]), rng.choice([8.0, 36.0])
+        spawn = replace(spawn, desired_speed_mps=crawl)
+    stretches = random_stretches(lanes, rng) if road != "highway" else ()
+    options = {
+        "lanes": lanes,
+        "vehicles": vehicles,
+        "spawn": spawn,
+        "mobil": rng.random() < 0.75,
+        "period_s": rng.choice([0.1, 0.3, 0.5, 1.0]),
+        "goal_m": rng.choice([60.0, 5000.0]),
+        "timeout_s": rng.choice([4.0, 1000.0]),
+        "abort": rng.random() < 0.5,
+        "visibility": rng.choice(list(Visibility)),
+        "seed": rng.randrange(10**9),
+        "recycle": rng.random() < 0.5 and not stretches,
+        "stretches": stretches,
+        "flow": random_flow(stretches, rng) if road == "flow" else None,
+        "actions": ActionParameters(form),
+        "dtype": torch.float32,
+    }
+    return environment(num_envs=rows, **{**options, **others})
+
+
+def disturbed_start(env: HighwayEnv, generator: torch.Generator) -> TensorDictBase:
+    """A first state with everything a little off.
+
+    Some, egos among them, are in mid-change, at odd angles, with turned wheels, seen in all ways or
+    not at all.
+    """
+    td = env.reset()
+    start = Vehicles.of(td[keys.VEHICLES])
+    between = drawing(start.x.shape, generator, env.dtype)
+    side = (between(0, 1) < 0.3) * (between(0, 2).long() * 2 - 1)
+    scene = start.with_(
+        y=start.y + between(-0.5, 0.5) + 0.5 * side * between(0, 4),
+        heading=between(-0.03, 0.03),
+        speed=between(0, 30) * (between(0, 1) < 0.9),
+        length=between(4, 6),
+        width=between(1.8, 2.6),
+        desired_speed=between(15, 35),
+        target_lane=(start.target_lane + side).clamp(0, env.road.lanes - 1),
+        visibility=between(0, 3).long(),
+        valid=(between(0, 1) < 0.9) | start.is_ego(),
+    )
+    td[keys.VEHICLES].update(scene.as_dict())
+    td[keys.EGO, "change_direction"] = (scene.target_lane - start.target_lane)[:, 0]
+    wheels = between(-0.02, 0.02)
+    td[keys.TRAFFIC, "steering"] = wheels
+    td[keys.EGO, "steering"] = wheels[:, 0]
+    return td
+
+
+def random_actions(env: HighwayEnv, generator: torch.Generator) -> torch.Tensor:
+    """Random actions [N], mostly to keep the lane."""
+    if env.actions.form == "continuous":
+        between = drawing(env.batch_size, generator, env.dtype)
+        wheel = between(-0.4, 0.4) + between(-1, 1) * (between(0, 1) < 0.4)
+        return torch.stack((between(-1.1, 1.1), wheel), dim=1)
+    drawn = torch.rand(env.batch_size, generator=generator)
+    if env.actions.form == "lane_speed" and bool(drawn[0] < 0.5):
+        return torch.randint(3, 5, env.batch_size, generator=generator)
+    changes = torch.where(drawn < 0.1, keys.LEFT, keys.RIGHT)
+    return torch.where(drawn < 0.2, changes, keys.KEEP)
 
 
 def random_flow(stretches: Stretches, rng: random.Random) -> FlowParameters:

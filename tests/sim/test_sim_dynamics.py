@@ -94,4 +94,4 @@ def test_a_lane_change_takes_two_to_five_seconds_at_every_speed_without_overshoo
 )
 def test_steering_by_hand(steering, y, heading, speed, expected):
     turned = steer(*map(number, (steering, y, heading, speed)), ZERO, 0.1).item()
-    assert turned == (pytest.approx(expected, abs=1e-8) if expected == 0.00227623 else expected)
+    assert turned == pytest.approx(expected, abs=1e-8)

@@ -195,13 +195,11 @@ def test_the_critical_speed_of_linear_theory(desired, critical):
     # 400 cars in steps of 0.1 s: within 0.01 m/s. 50 are too few for the longest waves: 0.2 to 0.3
     # lower.
     for cars, tolerance in ((400, 0.01), (CARS, 0.35)):
-
-        def growth(v, cars=cars):
-            return stability.growth_rate(v, desired, cars, PHYSICS_STEP_S)[0]
-
-        assert stability.zero_of(growth, threshold - 1.5, threshold + 1.5) == pytest.approx(
-            threshold, abs=tolerance
+        below, above = (
+            stability.growth_rate(speed, desired, cars, PHYSICS_STEP_S)[0]
+            for speed in (threshold - tolerance, threshold + tolerance)
         )
+        assert below > 0.0 > above
 
 
 def test_every_ring_grows_or_decays_at_the_rate_of_the_linear_theory():
@@ -233,7 +231,8 @@ def test_in_1500_s_a_small_disturbance_grows_below_the_critical_speed_and_dies_a
     displacement = 1e-4 * np.random.default_rng(0).standard_normal((4, CARS))
     away = deviations(disturbed_rings(displacement, np.zeros_like(displacement)), steps)
     for case, (desired, speed) in enumerate(CASES):
-        matrix = stability.step_matrix(speed, desired, CARS, PHYSICS_STEP_S, ring=True)
+        ahead = np.roll(np.eye(CARS), 1, axis=0)
+        matrix = stability.step_matrix(speed, desired, ahead, PHYSICS_STEP_S)
         expected = np.linalg.matrix_power(matrix, steps) @ np.append(
             displacement[case], np.zeros(CARS)
         )

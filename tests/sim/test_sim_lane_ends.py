@@ -4,7 +4,7 @@ import random
 
 import pytest
 import torch
-from reference.worlds import random_scenes, random_stretches, rows_of
+from reference.worlds import random_scenes, random_stretches
 
 from ganlane.settings.road import EXIT, FAR_M, NOTHING, WALL, LaneStretch
 from ganlane.sim.idm import following_acceleration
@@ -70,7 +70,7 @@ def test_a_row_on_its_own_road_is_as_alone_on_that_road(fact, roads, cars):
     together = FACTS[fact](cars, of_rows)
     differ = 0
     for row, lanes in enumerate(LANES):
-        alone = rows_of(cars, slice(row, row + 1))
+        alone = cars.part([row])
         expected = FACTS[fact](alone, Road(lanes, WIDTH_M, stretches=roads[row]))
         assert torch.equal(together[row : row + 1], expected)
         # And the lanes' ends matter.

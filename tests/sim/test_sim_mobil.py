@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.worlds import DOUBLE, drawing, moves, random_scenes, rows_of, vehicles, vehicles_at
+from reference.worlds import DOUBLE, drawing, moves, random_scenes, vehicles, vehicles_at
 
 from ganlane.settings.driving import MobilParameters, Visibility
 from ganlane.sim import mobil as mobil_module
@@ -21,7 +21,6 @@ from ganlane.sim.mobil import (
     mobil_changes,
     mobil_criterion,
     mobil_wishes,
-    safe_change,
     without_ego,
 )
 from ganlane.sim.neighbours import FREE_GAP_M, perceive
@@ -86,23 +85,6 @@ def test_nobody_changes_in_front_of_somebody_who_would_have_to_brake_too_hard():
     """-0.7 (99.293656 / gap)^2 = -4 at a gap of 41.537 m."""
     assert wish(SUBJECT, SLOW, fast_follower(41.6), mobil=SELFISH) == 1
     assert wish(SUBJECT, SLOW, fast_follower(41.5), mobil=SELFISH) == 0
-
-
-# Lorries
-
-
-@pytest.mark.parametrize(("length", "safe"), [(4.5, True), (12.0, False)])
-def test_a_gap_that_is_safe_for_a_car_may_not_be_so_for_a_lorry(length, safe):
-    """Centres 20 m apart, both at 20 m/s: 15.5 m are left behind a car, 11.75 m behind a lorry.
-
-    IDM wants 34 m, so it asks for 0.7 (1 - 0.8^4 - (34 / gap)^2): -3.0 and -5.4 m/s2; safe is -4
-    m/s2.
-    """
-    scene = perceive(
-        vehicles({"x": 0.0, "lane": 0, "length": length}, {"x": -20.0, "lane": 1}), Road()
-    )
-    lane = torch.tensor([[1.0, 0.0]], dtype=DOUBLE)
-    assert safe_change(scene, lane, TABLE_V)[0, 0].item() is safe
 
 
 # The promise, at the decision
@@ -211,7 +193,7 @@ def merges(rows):
     road = Road(lanes=2)
     change = mobil_changes(perceive(scene, road), mobil=SELFISH)
     scene = scene.with_(target_lane=lane + change * (torch.arange(4) == ENTERS))
-    return rows_of(scene, change[:, ENTERS] == 1)
+    return scene.part(change[:, ENTERS] == 1)
 
 
 def demand(scene):

@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from reference.worlds import drawing, moves, rows_of, vehicles, vehicles_at
+from reference.worlds import drawing, moves, vehicles, vehicles_at
 
 from ganlane.settings.driving import Visibility
 from ganlane.sim import idm
@@ -104,7 +104,7 @@ def first_changes(lane_width_m, length_m):
         length=zero[:, None].expand(-1, 2) + length_m,
         desired_speed=torch.stack((zero + DESIRED_MPS, slower + 0.01), dim=1),
     )
-    return rows_of(scene, calm)
+    return scene.part(calm)
 
 
 def drive(lane_width_m, length_m):

@@ -4,8 +4,9 @@ import pickle
 
 import pytest
 import torch
-from reference.foreign import assert_same_alone, drive, overlaps, turns
 from reference.refusals import user_error
+from reference.traffics import drive, overlaps
+from reference.worlds import few_changes
 
 import ganlane_simulators
 from ganlane import keys
@@ -31,8 +32,15 @@ def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(
 def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_before(traffic):
     # In the middle of this the same roads have to be cleared, vehicles on their way across lanes
     # among them.
-    drive(HighwayEnv(traffic, 3), [11, 12, 13], 17, turns)
-    assert_same_alone(HighwayEnv, traffic, [1, 3, 6], 24)
+    drive(HighwayEnv(traffic, 3), [11, 12, 13], 17, few_changes)
+    episodes = [1, 3, 6]
+    together, running, _ = drive(HighwayEnv(traffic, 3), episodes, 24, few_changes)
+    for row, episode in enumerate(episodes):
+        alone, ran, _ = drive(HighwayEnv(traffic, 1), [episode], 24, few_changes)
+        steps = int(running[:, row].sum())
+        assert steps == int(ran.sum()) > 0
+        for one, all_rows in zip(alone, together):
+            assert torch.equal(one[: steps + 1, 0], all_rows[: steps + 1, row])
 
 
 def test_a_copy_drives_on(traffic):

@@ -7,7 +7,7 @@ pytest.importorskip(
     "highway_env", reason="HighwayEnv is not installed: pip install 'ganlane[bench]'"
 )
 
-from reference.foreign import start
+from reference.traffics import start
 from reference.worlds import episode_keys, scalar_cars
 from reference.worlds import vehicles as scene_of
 

@@ -6,7 +6,7 @@ from reference.refusals import user_error
 
 pytest.importorskip("libsumo", reason="SUMO is not installed: pip install 'ganlane[sumo]'")
 
-from reference.foreign import drive, start
+from reference.traffics import drive, start
 
 from ganlane import keys
 from ganlane.agents.drivers import DRIVERS
@@ -14,7 +14,7 @@ from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.evaluation import run_episodes
 from ganlane.settings.driving import Visibility
 from ganlane.sim.scenes import FixedScene, SceneVehicle
-from ganlane.sim.state import Road, Vehicles, body_lanes
+from ganlane.sim.state import Road, body_lanes
 from ganlane_simulators import SumoTraffic
 
 LEFT = 1
@@ -49,7 +49,8 @@ def follower_of(traffic, lane_of_ego, action):
     rows = tuple(SceneVehicle(*car) for car in cars)
     first = FixedScene(rows, Road(), others_visibility=Visibility.BODY)
     env = HighwayEnv(traffic, 1, scenes=first)
-    driven, running, _ = drive(env, [0], 6, lambda decision, _: 0 if decision else action)
+    command = torch.tensor([action])
+    driven, running, _ = drive(env, [0], 6, lambda td: command * (td[keys.STEP] == 0))
     assert running.all()
     return driven
 
@@ -59,7 +60,7 @@ def test_a_follower_brakes_for_an_ego_that_moves_in_front_and_only_then():
     free = follower_of(keeps, 0, 0)
     cut_off = follower_of(keeps, 0, LEFT)
     assert free.speed[:, 0, 1].amin() > 19.0
-    ego = Vehicles(*(field[:, 0, :1] for field in cut_off))
+    ego = cut_off.at(0).columns(slice(1))
     enters = int((body_lanes(ego, Road()).high[:, 0] > 0).nonzero()[0])
     # The stand-in comes in at the start of the step at whose end the ego's body does.
     assert torch.equal(free.speed[:enters, 0, 1], cut_off.speed[:enters, 0, 1])

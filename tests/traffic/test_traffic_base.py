@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from reference.foreign import MAKE
 from reference.refusals import user_error
 from reference.synthetic import synthetic_scenes
+from reference.traffics import MAKE
 from reference.worlds import environment, same_bits
 from tensordict import TensorDict
 

@@ -9,15 +9,25 @@ from itertools import pairwise
 
 import pytest
 import torch
-from reference.foreign import all_faults, overlaps_of_the_others
 from reference.refusals import user_error
-from reference.worlds import environment, placed, same_bits, step, vehicles
+from reference.traffics import all_faults
+from reference.worlds import (
+    course,
+    environment,
+    episode_keys,
+    few_changes,
+    film_of,
+    moves,
+    run,
+    same_bits,
+    vehicles,
+)
 from scipy.stats import binomtest
 
 from ganlane import keys
-from ganlane.env import HighwayEnv
 from ganlane.settings.driving import AbortFaults, BrakingFaults, HesitationFaults, ReactionFaults
-from ganlane.sim import Road, SpawnParameters, Vehicles, perceive
+from ganlane.sim import perceive
+from ganlane.sim.spawn import RandomScenes
 from ganlane.traffic import (
     AbortedLaneChange,
     CalibratedChanges,
@@ -49,32 +59,19 @@ class OneChange(IdmTraffic):
         return self.drive(perceive(vehicles, self.road), changed, memory, step)
 
 
-def states(traffic, state, steps):
-    """The state and what becomes of it in each physics step; the ego is one of the traffic."""
-    yield state.clone()
-    for number in range(steps):
-        state[keys.STEP] = torch.full(state.batch_size, number)
-        traffic(state)
-        state[keys.VEHICLES] = state.pop(keys.MOVED)
-        yield state.clone()
-
-
 def play(base, scene, steps, **overlays):
-    """The one scene after each physics step, [T, M]."""
-    traffic = TrafficSequential({"base": base, **overlays})
-    start = placed(environment(vehicles=scene.x.shape[1], traffic=traffic), scene)
-    _, *film = states(traffic, start, steps)
-    return Vehicles.of(torch.cat([state[keys.VEHICLES] for state in film]))
+    """The one scene after each physics step, [T, M]; the ego is one of the traffic."""
+    return film_of(moves(TrafficSequential({"base": base, **overlays}), scene, steps)).at(0)
 
 
 def in_traffic(traffic, steps, part, field):
     """A field of the memory before and after each physics step of 192 episodes, and target lanes
     before and after; of all but the ego.
     """
-    start = environment(num_envs=192, traffic=traffic, dtype=torch.float32).reset()
-    for pair in pairwise(states(traffic, start, steps)):
-        memories = (state[keys.TRAFFIC, part, field][:, 1:] for state in pair)
-        lanes = (state[keys.VEHICLES, "target_lane"][:, 1:] for state in pair)
+    scene = RandomScenes()(episode_keys(range(192)), torch.float32)
+    for pair in pairwise(course(traffic, scene, steps)):
+        memories = (memory[part, field][:, 1:] for _, memory in pair)
+        lanes = (cars.target_lane[:, 1:] for cars, _ in pair)
         yield *memories, *lanes
 
 
@@ -129,12 +126,10 @@ def test_the_share_of_changes_asked_for_is_hesitant_or_broken_off(fault, field):
 
 def test_with_everything_off_the_base_is_left_bitwise_as_it_is():
     plain, faulty = (
-        environment(num_envs=16, traffic=traffic)
+        run(environment(num_envs=16, traffic=traffic), 6, few_changes)
         for traffic in (IdmMobilTraffic(), with_faults(IdmMobilTraffic(), NONE))
     )
-    one, other = plain.reset(), faulty.reset()
-    for decision in range(6):
-        one, other = step(plain, one, decision % 3), step(faulty, other, decision % 3)
+    for one, other in zip(plain, faulty):
         assert same_bits(one.exclude(keys.TRAFFIC), other.exclude(keys.TRAFFIC)) == []
         assert same_bits(one[keys.TRAFFIC], other[keys.TRAFFIC, "base"]) == []
 
@@ -199,10 +194,7 @@ def test_a_phantom_braker_loses_the_speed_it_says_and_goes_on_as_before():
 def test_faults_come_to_nobody_who_is_not_there_and_never_to_the_ego():
     scene = vehicles(EGO, {"x": 0.0, "valid": False}, {"x": 100.0})
     traffic = with_faults(OneChange(), all_faults(1e9, 1.0))
-    td = placed(environment(vehicles=3, traffic=traffic), scene)
-    td[keys.STEP] = torch.tensor([10])
-    traffic(td)
-    memory = td[keys.TRAFFIC]
+    *_, (_, memory) = course(traffic, scene, 11)
     for come in (
         memory["phantom_braking", "left"] > 0,
         memory["late_reaction", "left"] > 0,
@@ -215,17 +207,3 @@ def test_faults_come_to_nobody_who_is_not_there_and_never_to_the_ego():
 def test_a_delay_shorter_than_a_step_is_refused():
     with user_error(r"delay_s=0\.01: expected at least 0\.1"):
         LateReaction(faults=ReactionFaults(delay_s=0.01))
-
-
-@pytest.mark.parametrize(
-    ("faults", "vehicle_km", "rows", "seconds"),
-    # Ten times the default rates and more.
-    [
-        (all_faults(120.0, 0.5), 100.0, 24, 60),
-        pytest.param(None, 5000.0, 128, 100, marks=pytest.mark.slow),
-    ],
-)
-def test_faults_make_no_overlaps(faults, vehicle_km, rows, seconds):
-    traffic = idm_faults_traffic(Road(), 2, faults=faults)
-    env = HighwayEnv(traffic, rows, 14, SpawnParameters(spread_m=300.0), kernel="auto")
-    assert overlaps_of_the_others(env, vehicle_km, seconds) == 0

@@ -1,9 +1,9 @@
-"""``traffic=human``: decisions every 0.4 s, the same for an episode wherever it is driven."""
+"""``traffic=human``: decisions every 0.4 s, on the road and into nobody."""
 
 import pytest
 import torch
 from reference.refusals import user_error
-from reference.worlds import episode_keys, vehicles_at
+from reference.worlds import course, episode_keys, moves, vehicles_at
 
 from ganlane import keys
 from ganlane.api import make_env
@@ -16,18 +16,10 @@ from ganlane.traffic import IdmTraffic
 from ganlane.traffic.presets import human_traffic
 
 
-def course(traffic, vehicles, key, steps, change=lambda before, after: after):
-    """Vehicles and memory after every step, and what ``change`` makes of the vehicles."""
-    memory = traffic.fresh_memory(vehicles, key)
-    for step in range(steps):
-        moved, memory = traffic.move(vehicles, memory, key, torch.full_like(key, step))
-        vehicles = change(vehicles, moved)
-        yield vehicles, memory
-
-
-def drive(episodes, steps, dtype=torch.float32, **variation):
-    key = episode_keys(episodes)
-    return list(course(human_traffic(**variation), RandomScenes()(key, dtype), key, steps))
+def drive(rows, steps, dtype=torch.float32, **variation):
+    """Vehicles and memory after each step of episodes 0 to ``rows`` - 1."""
+    scene = RandomScenes()(episode_keys(range(rows)), dtype)
+    return list(course(human_traffic(**variation), scene, steps))
 
 
 def column(x, speed, desired_mps):
@@ -42,7 +34,7 @@ def column(x, speed, desired_mps):
 
 
 def test_a_decision_holds_for_four_steps():
-    states = drive([0, 1, 2], 8)
+    states = drive(3, 8)
     held = torch.stack([memory["acceleration"] for _, memory in states])
     assert torch.equal(held[0], held[STEPS - 1])
     assert not torch.equal(held[STEPS - 1], held[STEPS])
@@ -53,20 +45,16 @@ def test_a_decision_holds_for_four_steps():
     assert torch.allclose(speed[moving], expected[moving], atol=1e-3)
 
 
-def test_an_episode_is_the_same_among_others_and_in_rows_that_decide_at_other_times():
-    together, alone = drive([0, 1, 2], 40), drive([1], 40)
-    for (many, _), (one, _) in zip(together, alone):
-        assert torch.allclose(many.x[1], one.x[0], atol=1e-3)
-        assert torch.equal(many.target_lane[1], one.target_lane[0])
-    vehicles, memory = together[1]
-    # Rows at steps 2, 4 and 5: one of them decides.
+def test_a_row_decides_at_its_own_time():
+    """At steps 2, 4 and 5 of three rows one of them."""
+    *_, (vehicles, memory) = drive(3, 2)
     clocks = torch.tensor([2, 4, 5])
-    _, after = human_traffic().move(vehicles, memory, episode_keys([0, 1, 2]), clocks)
+    _, after = human_traffic().move(vehicles, dict(memory.items()), episode_keys([0, 1, 2]), clocks)
     assert (after["age"] == memory["age"]).all(1).tolist() == [True, False, True]
 
 
 def test_half_a_minute_of_driving_has_no_collision_and_nobody_leaves_the_road():
-    states = drive(range(16), 300)
+    states = drive(16, 300)
     vehicles, _ = states[-1]
     assert vehicles.speed[:, 1:].min() > 5.0
     for vehicles, _ in states[::20]:
@@ -76,7 +64,7 @@ def test_half_a_minute_of_driving_has_no_collision_and_nobody_leaves_the_road():
 
 
 def test_it_drives_in_double_precision_and_on_one_lane():
-    vehicles, _ = drive([0], 8, torch.float64)[-1]
+    vehicles, _ = drive(1, 8, torch.float64)[-1]
     assert vehicles.x.dtype == torch.float64
     env = make_env("human", num_envs=2, env={"lanes": 1, "vehicles": 4})
     after = env.rollout(5)
@@ -85,7 +73,7 @@ def test_it_drives_in_double_precision_and_on_one_lane():
 
 def changes(rows, **variation):
     """Lane changes that are begun within 10 s."""
-    states = drive(range(rows), 100, **variation)
+    states = drive(rows, 100, **variation)
     lanes = torch.stack([vehicles.target_lane for vehicles, _ in states])
     return int((lanes.diff(dim=0) != 0).sum())
 
@@ -102,7 +90,7 @@ def test_drivers_do_not_run_into_a_slow_car_far_ahead():
 
     traffic = human_traffic(Road(1))
     struck = torch.zeros(100, dtype=torch.bool)
-    for cars, _ in course(traffic, start, episode_keys(range(100)), 300, slow_one_goes_on):
+    for cars in moves(traffic, start, 300, slow_one_goes_on):
         struck |= pair_overlaps(cars).flatten(1).any(1)
     assert struck.float().mean() <= 0.02
     assert cars.speed[:, 1].median() < 5.0
@@ -124,10 +112,8 @@ def test_a_stop_and_go_wave_forms_on_a_ring_where_idm_drivers_flow_on():
     road = Road(1, ring_m=300.0)
     noise = 0.3 * torch.randn(4, 22, generator=torch.Generator().manual_seed(0))
     even = column(torch.arange(22) * 300.0 / 22 + noise, torch.tensor(4.0), 15.0)
-    wave, flow = (
-        list(course(traffic, even, episode_keys(range(4)), 1000))[-1][0]
-        for traffic in (human_traffic(road), IdmTraffic(road))
-    )
+    *_, wave = moves(human_traffic(road), even, 1000)
+    *_, flow = moves(IdmTraffic(road), even, 1000)
     # Somebody nearly stands while others go on.
     assert wave.speed.min(1).values.mean() < 1.0
     assert wave.speed.max(1).values.mean() > 6.0

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.foreign import overlaps_of_the_others, start
 from reference.refusals import user_error
-from reference.worlds import DOUBLE, environment, placed, step, vehicles
+from reference.traffics import start
+from reference.worlds import DOUBLE, environment, few_changes, placed, run, vehicles
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.settings.driving import RandomDrivers
 from ganlane.settings.traffic import IdmRandomTrafficConfig
-from ganlane.sim import Road, SpawnParameters
+from ganlane.sim import Road
 from ganlane.traffic import IdmMobilTraffic, IdmRandomTraffic
 from ganlane.traffic.idm_mobil import DriverParams, start_braking
 
@@ -69,11 +69,8 @@ def test_desired_speeds_are_the_drivers_own_and_the_egos_is_not_touched():
 
 def test_a_driver_stays_the_same_through_an_episode_and_is_another_in_the_next():
     env = environment(num_envs=4, traffic=IdmRandomTraffic())
-    td = env.reset()
-    first = td[keys.TRAFFIC, "traits"]
-    for _ in range(3):
-        td = step(env, td)
-        assert torch.equal(td[keys.TRAFFIC, "traits"], first)
+    first, *later = (td[keys.TRAFFIC, "traits"] for td in run(env, 3))
+    assert all(torch.equal(traits, first) for traits in later)
     others = start(env, range(4, 8))[keys.TRAFFIC, "traits"]
     assert (others[..., 0] != first[..., 0]).all()
 
@@ -81,24 +78,19 @@ def test_a_driver_stays_the_same_through_an_episode_and_is_another_in_the_next()
 def test_drivers_who_are_all_alike_drive_as_idm_mobil():
     ends = []
     for traffic in (IdmMobilTraffic(), IdmRandomTraffic(drivers=ALIKE)):
-        env = environment(num_envs=8, traffic=traffic)
-        td = env.reset()
-        for _ in range(8):
-            td = step(env, td)
+        *_, td = run(environment(num_envs=8, traffic=traffic), 8)
         ends.append(dict(td[keys.VEHICLES].select("x", "y", "speed", "target_lane")))
     torch.testing.assert_close(*ends, atol=1e-9, rtol=1e-9)
 
 
 def test_nobody_brakes_harder_than_it_can():
     env = environment(num_envs=192, traffic=IdmRandomTraffic())
-    td = env.reset()
     margins = []
-    limit = params_of(td).strongest_braking
+    limit = params_of(env.reset()).strongest_braking
     env.recorder = lambda now, running: margins.append(
         (now.acceleration + limit)[:, 1:].amin().item()
     )
-    for _ in range(12):
-        td = step(env, td, (td[keys.EPISODE] + td[keys.EGO, "decisions"]) % 4 % 3)
+    run(env, 12, few_changes)
     # Some came to their limit.
     assert -1e-9 <= min(margins) < 1e-6
 
@@ -119,10 +111,8 @@ def test_a_reaction_time_delays_the_acceleration_by_as_much():
     for delay, steps in ((0.0, 1), (0.4, 5)):
         traffic = IdmRandomTraffic(drivers=replace(ALIKE, reaction_s=(delay, delay)))
         env = environment(vehicles=3, traffic=traffic, period_s=0.1)
-        td = placed(env, scene)
-        for _ in range(steps):
-            td = step(env, td)
-            asked.append(td[keys.VEHICLES, "acceleration"][0, 2].item())
+        _, *states = run(env, steps, start=placed(env, scene))
+        asked += [td[keys.VEHICLES, "acceleration"][0, 2].item() for td in states]
     prompt, *waits, late = asked
     assert prompt < -1.0
     assert waits == [0.0] * 4
@@ -134,18 +124,11 @@ def test_a_driver_sways_within_its_lane(lane_width_m, bound):
     road = Road(lanes=3, lane_width_m=lane_width_m)
     widest = replace(RandomDrivers(), sway_m=(0.3, 0.3))
     env = HighwayEnv(IdmRandomTraffic(road, drivers=widest), 24, dtype=torch.float64)
-    td = env.reset()
     ways = []
-    for _ in range(12):
-        td = step(env, td)
+    for td in run(env, 12):
         off = td[keys.VEHICLES, "y"] - lane_width_m * td[keys.VEHICLES, "target_lane"]
         ways.append(torch.where(off.abs() < 0.5 * lane_width_m, off, 0.0)[:, 1:])
     way = torch.stack(ways)
     # Between lane changes; those under way are left out by taking the 90 % quantile.
     assert way.abs().flatten(1).quantile(0.9) <= bound + 0.05
     assert way.std(0).mean() > 0.2 * bound
-
-
-def test_random_drivers_do_not_touch_each_other_in_500_vehicle_km_with_an_ego_that_keeps_its_lane():
-    env = HighwayEnv(IdmRandomTraffic(), 64, 14, SpawnParameters(spread_m=300.0), kernel="auto")
-    assert overlaps_of_the_others(env, 500.0, ego=True) == 0

@@ -1,39 +1,15 @@
-"""Traffic with lorries does not run into itself, nor into an ego that keeps its lane."""
+"""Lorries: what the generator is told of them, and what the realism card measures."""
 
 import numpy as np
 import pytest
 import torch
-from reference.foreign import overlaps_of_the_others
 from reference.worlds import vehicles
 
-import ganlane
 from ganlane.generator.closed_loop import extra_inputs
 from ganlane.realism.long_runs import LongRunParameters
 from ganlane.realism.starts import spawned_recordings
 from ganlane.sim import Road, SpawnParameters, perceive
 from ganlane.traffic import IdmTraffic
-
-
-@pytest.mark.parametrize(
-    ("traffic", "rows", "recycle", "vehicle_km"),
-    [
-        ("idm", 32, False, 170.0),
-        ("idm_mobil", 32, True, 170.0),
-        ("gan_calibrated", 8, False, 40.0),
-        # On a road that stays full.
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (
-                ("idm", 64, True, 1760.0),
-                ("idm_mobil", 64, True, 1800.0),
-                ("gan_calibrated", 48, True, 840.0),
-            )
-        ),
-    ],
-)
-def test_nobody_overlaps_a_lorry(traffic, rows, recycle, vehicle_km):
-    env = ganlane.make_env(traffic, rows, truck_share=0.4, recycle=recycle).base_env
-    assert overlaps_of_the_others(env, vehicle_km, ego=True) == 0
 
 
 def test_the_generator_is_told_the_gap_behind_the_lorry():

@@ -4,15 +4,15 @@ the ego.
 
 import pytest
 import torch
-from reference.foreign import MAKE, assert_close
 from reference.refusals import user_error
+from reference.traffics import MAKE, assert_close
 from reference.worlds import (
     environment,
     episode_keys,
     few_changes,
     placed,
+    run,
     same_bits,
-    step,
     vehicles,
 )
 from scipy.stats import binomtest
@@ -40,8 +40,7 @@ def mixture(**shares):
 
 def drive(traffic, rows, decisions=6):
     env = environment(num_envs=rows, traffic=traffic, dtype=torch.float32)
-    td = env.reset()
-    return [td := step(env, td, few_changes(td)) for _ in range(decisions)]
+    return run(env, decisions, few_changes)
 
 
 @pytest.mark.parametrize(
@@ -143,8 +142,8 @@ def test_a_follower_brakes_for_an_ego_unless_it_does_not_see_it_and_the_environm
     """A fast driver behind a slow ego, second by second."""
     env = environment(vehicles=2, traffic=BlindTraffic(IdmTraffic(), share))
     slow, fast = ({"speed": speed, "desired_speed": speed} for speed in (10.0, 25.0))
-    td = placed(env, vehicles({"x": 0.0, **slow}, {"x": -60.0, **fast}))
-    track = [td := step(env, td) for _ in range(8)]
+    start = placed(env, vehicles({"x": 0.0, **slow}, {"x": -60.0, **fast}))
+    track = run(env, 8, start=start)
     slowest = min(td[keys.VEHICLES, "speed"][0, 1].item() for td in track)
     assert any(bool(td[keys.EVENTS, "hard_crash"]) for td in track) == (share == 1.0)
     assert slowest > 24.9 if share else slowest < 15.0

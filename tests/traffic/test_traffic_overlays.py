@@ -4,10 +4,12 @@ import math
 
 import pytest
 import torch
-from reference.foreign import beyond_the_edge, others_of, overlaps
+from reference.traffics import beyond_the_edge, others_of, overlaps
+from reference.worlds import episode_keys, film_of, moves
 
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.sim import Vehicles, pair_overlaps
+from ganlane.sim.spawn import RandomScenes
 from ganlane.traffic import (
     AccelerationOverlay,
     CalibratedLaneChange,
@@ -33,11 +35,13 @@ class Drift(TrafficModule):
     def move(self, vehicles, memory, key, step):
         speed = vehicles.speed + self.acceleration * self.dt
         y = vehicles.y + self.lateral * self.dt
-        return vehicles.with_(x=vehicles.x + speed * self.dt, y=y, speed=speed), memory
+        acceleration = torch.full_like(speed, self.acceleration)
+        moved = {"x": vehicles.x + speed * self.dt, "y": y, "speed": speed}
+        return vehicles.with_(**moved, acceleration=acceleration), memory
 
 
 def run(rows, vehicles, seconds, base, **overlays):
-    """What :func:`reference.foreign.others_of` says of a chain."""
+    """What :func:`reference.traffics.others_of` says of a chain."""
     traffic = TrafficSequential({"base": base, **overlays})
     return others_of(traffic, rows, seconds, vehicles)
 
@@ -76,15 +80,10 @@ def test_sudden_accelerations_fill_a_third_of_the_time_with_the_spread_of_the_da
     # 2 s of waiting and 1 s of acceleration, in turn.
     sudden = SuddenAccelerations(every_s=2.0, lasts_s=1.0, mean=0.0, sd=0.8)
     overlay = AccelerationOverlay(sudden=sudden)
-    state = HighwayEnv(IdmTraffic(), num_envs=200).reset()
-    state["vehicles", "speed"][:] = 20.0
-    state["traffic"] = overlay.init_memory(Vehicles.of(state["vehicles"]), state["episode"])
-    record = []
-    for step in range(300):
-        state["step"] = torch.full((200,), step)
-        state["moved"] = state["vehicles"].clone()
-        record.append(overlay(state)["moved", "acceleration"])
-    acceleration = torch.stack(record)
+    traffic = TrafficSequential({"base": Drift(0.0, 0.0), "sudden": overlay})
+    scene = RandomScenes()(episode_keys(range(200)), torch.float32)
+    film = film_of(moves(traffic, scene, 300, lambda before, after: after.with_(speed=scene.speed)))
+    acceleration = film.acceleration
     active = acceleration.abs() > 1e-4
     assert active.float().mean().item() == pytest.approx(1 / 3, abs=0.02)
     assert acceleration[active].std().item() == pytest.approx(0.8, rel=0.05)

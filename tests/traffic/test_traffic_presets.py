@@ -4,15 +4,14 @@ import math
 from dataclasses import replace
 
 import pytest
-import torch
-from reference.foreign import beyond_the_edge, drive, others_of, overlaps, start
 from reference.refusals import user_error
+from reference.traffics import assert_close, beyond_the_edge, drive, keep_lane, others_of, overlaps
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.generator import shipped_generator
 from ganlane.native.drivers import SIMULATED_ANCHOR
-from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
+from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic, human_traffic
 from ganlane.weights import load_weights, save_weights
 
 
@@ -26,29 +25,14 @@ def test_with_its_guard_gan_traffic_stays_on_the_road_and_without_it_leaves_it()
 
 @pytest.mark.slow
 def test_no_vehicle_leaves_the_road_in_1000_episodes_of_gan_traffic():
-    worst = -9.0
-    ended = 0
-    for chunk in range(4):
-        env = HighwayEnv(gan_traffic(), num_envs=250)
-        state = start(env, range(250 * chunk, 250 * (chunk + 1)))
-        done = state["done"]
-
-        def record(vehicles, running):
-            nonlocal worst
-            worst = max(worst, beyond_the_edge(vehicles.columns(slice(1, None))))
-
-        env.recorder = record
-        for _ in range(1000):
-            state = env.step(state.set(keys.ACTION, torch.zeros(250, dtype=torch.int64)))["next"]
-            done = done | state["done"]
-            if done.all():
-                break
-        ended += int(done.sum())
-    print(
-        f"{ended} episodes to their end; the outermost body stayed {-worst:.2f} m inside the edge"
-    )
-    assert ended == 1000
-    assert worst <= 1e-4
+    env = HighwayEnv(gan_traffic(), num_envs=250)
+    worst = []
+    env.recorder = lambda now, running: worst.append(beyond_the_edge(now.columns(slice(1, None))))
+    td = env.reset()
+    while td[keys.EPISODE].min() < 1000:
+        _, td = env.step_and_maybe_reset(td.set(keys.ACTION, keep_lane(td)))
+    print(f"the outermost body stayed {-max(worst):.2f} m inside the edge")
+    assert max(worst) <= 1e-4
 
 
 def test_calibrated_traffic_neither_overlaps_nor_leaves_the_road_nor_stands_still():
@@ -72,13 +56,12 @@ def test_calibrated_traffic_changes_lanes_as_often_as_recorded_and_touches_nobod
     assert 0.70 < changes / km < 1.20
 
 
-@pytest.mark.parametrize("preset", [gan_traffic, gan_calibrated_traffic])
+@pytest.mark.parametrize("preset", [gan_traffic, gan_calibrated_traffic, human_traffic])
 def test_generated_traffic_is_the_same_in_every_batch_up_to_rounding(preset):
     many, alone = (
         drive(HighwayEnv(preset(), len(rows)), rows, 2)[2]["vehicles"] for rows in (range(6), [4])
     )
-    for name in ("x", "y", "speed"):
-        torch.testing.assert_close(many[name][4], alone[name][0], atol=2e-3, rtol=1e-4)
+    assert_close(many[4], alone[0])
 
 
 def fitted_with(folder, *without, **settings):

@@ -4,7 +4,7 @@ import pytest
 import torch
 from reference import scalar
 from reference.refusals import user_error
-from reference.worlds import environment, random_scenes, rows_of, vehicles
+from reference.worlds import environment, random_scenes, vehicles
 from tensordict import TensorDict
 from torchrl.envs import ActionMask, Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -46,7 +46,7 @@ def test_commands_off_the_road_are_never_allowed(lane, expected):
 def test_every_row_has_the_lanes_of_its_own_road():
     road = Road(lanes=torch.tensor([[2], [3]]), lane_width_m=torch.tensor([[4.0], [4.0]]))
     middle = vehicles({"x": 0.0, "lane": 1})
-    both = rows_of(middle, [0, 0])
+    both = middle.part([0, 0])
     mask, _ = ActionMaskTransform(road, "legal").allowed(both, torch.zeros(2).long(), road)
     assert mask.tolist() == [RIGHT_ONLY, ALL]
 
@@ -119,14 +119,6 @@ def test_foresight_forbids_what_safe_forbids_and_more(crowd):
     assert not (foresight & ~safe).any()
     share = foresight[:, 1:].sum() / safe[:, 1:].sum()
     assert 0.5 < share < 0.98
-
-
-@pytest.mark.kernel
-@pytest.mark.parametrize("form", ["safe", "foresight"])
-def test_the_kernel_allows_what_the_tensor_code_allows(crowd, form):
-    transform = ActionMaskTransform(Road(), form, native_vehicles=12)
-    by_kernel = transform.native.allowed(crowd, IDLE)
-    assert all(map(torch.equal, by_kernel, transform.allowed(crowd, IDLE, Road())))
 
 
 # --- in the environment

@@ -43,22 +43,25 @@ def neighbours_in(values, numbers=4):
 
 
 @pytest.mark.parametrize(
-    ("rows", "expected"),
+    ("lanes", "rows", "expected"),
     [
         # The ego's speed over its desired speed, not clipped, and the lanes beside it. Then another
         # vehicle: position over 200 m, speed over 30 m/s, half a unit per lane.
-        ([EGO, (50.0, 2, 26.0)], [0.8, 1.0, 1.0, 0.25, 0.2, 0.5]),
-        ([(0.0, 2, 20.0), (-20.0, 0, 14.0)], [0.8, 0.0, 1.0, -0.1, -0.2, -1.0]),
-        ([(0.0, 0, 30.0), (50.0, 1, 30.0)], [1.2, 1.0, 0.0, 0.25, 0.0, 0.5]),
+        (3, [EGO, (50.0, 2, 26.0)], [0.8, 1.0, 1.0, 0.25, 0.2, 0.5]),
+        (3, [(0.0, 2, 20.0), (-20.0, 0, 14.0)], [0.8, 0.0, 1.0, -0.1, -0.2, -1.0]),
+        (3, [(0.0, 0, 30.0), (50.0, 1, 30.0)], [1.2, 1.0, 0.0, 0.25, 0.0, 0.5]),
         # The nearest first, whatever their index; far ones are clipped to one.
         (
+            3,
             [EGO, (90.0, 1, 20.0), (-30.0, 1, 20.0), (900.0, 1, 60.0), (-901.0, 1, 0.0)],
             [0.8, 1.0, 1.0, -0.15, 0.0, 0.0, 0.45, 0.0, 0.0, 1.0, 1.0, 0.0, -1.0, -2 / 3, 0.0],
         ),
+        # One lane has none beside the ego, and no lane difference.
+        (1, [(0.0, 0, 20.0), (50.0, 0, 20.0)], [0.8, 0.0, 0.0, 0.25, 0.0, 0.0]),
     ],
 )
-def test_table_3(rows, expected):
-    assert observed(scene_of(*rows), "table3").tolist() == pytest.approx(expected)
+def test_table_3(lanes, rows, expected):
+    assert observed(scene_of(*rows), "table3", Road(lanes)).tolist() == pytest.approx(expected)
 
 
 def test_in_table_3_one_that_is_not_valid_reads_far_ahead_and_comes_last():
@@ -68,12 +71,6 @@ def test_in_table_3_one_that_is_not_valid_reads_far_ahead_and_comes_last():
     assert observed(scene, "table3")[3:].tolist() == pytest.approx(expected)
 
 
-def test_in_table_3_a_road_of_one_lane_has_none_beside_the_ego_and_no_lane_difference():
-    scene = scene_of((0.0, 0, 20.0), (50.0, 0, 20.0))
-    expected = [0.8, 0.0, 0.0, 0.25, 0.0, 0.0]
-    assert observed(scene, "table3", Road(1)).tolist() == pytest.approx(expected)
-
-
 def test_progress_adds_the_egos_own_lane_change():
     scene = scene_of(EGO, (50.0, 1, 20.0))
     values = observed(scene, "table3_progress", progress=0.25, direction=-1)
@@ -81,11 +78,12 @@ def test_progress_adds_the_egos_own_lane_change():
 
 
 def test_the_lane_view_holds_the_nearest_ahead_and_behind_in_three_lanes():
+    """Bumper to bumper: half of the car, and half of the lorry that leads or follows."""
     scene = scene_of(EGO, (50.0, 2, 26.0), (90.0, 2, 20.0), (-34.5, 1, 14.0))
+    scene.length[0, [1, 3]] = 12.0
     view = neighbours_in(observed(scene, "lane_view"), 3)
-    gap = 45.5
-    assert view[0].tolist() == pytest.approx([gap / 200, np.exp(-gap / 15.0), 0.2])
-    assert view[3].tolist() == pytest.approx([30.0 / 200, np.exp(-2.0), -0.2])
+    for row, gap, faster in ((0, 41.75, 0.2), (3, 26.25, -0.2)):
+        assert view[row].tolist() == pytest.approx([gap / 200, np.exp(-gap / 15.0), faster])
     assert view[[1, 2, 4, 5]].tolist() == [NOBODY] * 4
 
 
@@ -136,18 +134,6 @@ def test_no_number_but_the_first_exceeds_the_largest_of_its_form(form, length_m)
         assert values.max() == largest == 1.0 + length_m
     else:
         assert largest == 1.0
-
-
-@pytest.mark.parametrize(("row", "x_m", "lane"), [(0, 30.0, 2), (5, -30.0, 0)])
-def test_the_gap_to_a_lorry_is_bumper_to_bumper_ahead_and_behind(row, x_m, lane):
-    """Centres 30 m apart.
-
-    2.25 m of the car and 6 m of the lorry lie between them, so 21.75 m are free.
-    """
-    lorry = {"x": x_m, "lane": lane, "length": 12.0}
-    view = neighbours_in(observed(vehicles({"x": 0.0, "lane": 1}, lorry), "lane_view"), 3)
-    assert view[row, 0].item() == pytest.approx(21.75 / 200)
-    assert view[row, 1].item() == pytest.approx(np.exp(-21.75 / 15.0))
 
 
 @pytest.mark.parametrize(("share", "largest"), [(0.0, 5.5), (0.5, 13.0)])

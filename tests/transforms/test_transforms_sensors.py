@@ -12,7 +12,7 @@ from reference.worlds import (
     environment,
     episode_keys,
     few_changes,
-    rows_of,
+    run,
     same_bits,
     tracks,
     vehicles,
@@ -42,19 +42,14 @@ def world(sensors, num_envs=3, goal_m=5000.0, period_s=1.0, form="table3", seed=
 
 
 def drive(env, decisions):
-    """The states of a run without resets, the first one included, and the rewards that led to the
-    others.
-    """
-    states = [env.reset()]
-    for _ in range(decisions):
-        states.append(env.step(states[-1].clone().set("action", few_changes(states[-1])))["next"])
-    return states
+    """The states of a run without resets, and the rewards that led to them."""
+    return run(env, decisions, few_changes)
 
 
 def scene(rows, count):
     """``rows`` copies of a row of cars, 10 m from each other on the middle lane, at 20 m/s."""
     one = vehicles(*({"x": 10.0 * i, "lane": 1} for i in range(count)))
-    return rows_of(one, [0] * rows)
+    return one.part([0] * rows)
 
 
 def many(sensors):

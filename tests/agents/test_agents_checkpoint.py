@@ -15,6 +15,7 @@ from ganlane.agents import (
     save_agent,
     warm_start,
 )
+from ganlane.agents.checkpoint import SHIPPED
 from ganlane.weights import load_weights, save_weights
 
 
@@ -54,7 +55,7 @@ def test_an_unknown_agent_is_refused_with_the_names_there_are():
 def test_shipped_agents_are_found_by_name(saved, monkeypatch):
     monkeypatch.setattr(checkpoint, "CHECKPOINTS", saved.parent)
     saved.rename(saved.with_name("agent_idm.safetensors"))
-    assert agent_file("agent_idm") == agent_file("agent_idm@0")
+    assert agent_file("agent_idm") == agent_file(f"agent_idm@{SHIPPED['agent_idm']}")
     assert load_agent("agent_idm")[1]["observation"] == "table3"
 
 

@@ -21,8 +21,10 @@ from ganlane.files import CHECKPOINTS
 from ganlane.settings.agent import RainbowConfig
 from ganlane.weights import load_weights, save_weights
 
-#: Agents that come with the package, each the training with seed 0; others are given by their path.
-SHIPPED = ("agent_general", "agent_idm", "agent_gan")
+#: Agents that come with the package, and their seeds. Of five trainings each is the median by the
+#: mean reward on the traffic of its training, of episodes that are kept for choosing
+#: (docs/drivers.md). Others are given by their path.
+SHIPPED = {"agent_general": 0, "agent_idm": 2, "agent_gan": 2}
 #: Kind of a file with several agents.
 SEVERAL = "agents"
 #: What says which returns the outputs of a distributional network stand for.
@@ -36,7 +38,7 @@ def _place(name: str | Path) -> tuple[Path, int | None]:
         seed = int(digits)
         # Further trainings of a shipped recipe lie in a file of their own, which a light wheel
         # lacks.
-        if recipe in SHIPPED and seed > 0:
+        if recipe in SHIPPED and seed != SHIPPED[recipe]:
             return _seeds_file(recipe), seed
         if recipe in SHIPPED:
             name = recipe
@@ -78,11 +80,11 @@ def with_seeds(name: str) -> list[str]:
         seeds = sorted(_read_several(Path(recipe))[1])
     elif _seeds_file(recipe).is_file():
         # One training is the shipped agent itself; the others are packed together.
-        seeds = sorted([0, *_read_several(_seeds_file(recipe))[1]])
+        seeds = sorted([SHIPPED[recipe], *_read_several(_seeds_file(recipe))[1]])
     else:
         raise UserError(
-            f"{name}: only the training {recipe}@0 is installed (a light wheel); give that, or run "
-            "pip install -e . in a clone."
+            f"{name}: only the training {recipe}@{SHIPPED[recipe]} is installed (a light wheel); "
+            "give that, or run pip install -e . in a clone."
         )
     return [f"{recipe}@{seed}{mask}" for seed in seeds]
 
@@ -107,7 +109,7 @@ def agent_file(name: str | Path) -> Path:
     path, seed = _place(name)
     if not os.path.isfile(path):  # which takes names that are too long for a file
         shipped = sorted(file.stem for file in CHECKPOINTS.glob("agent_*.safetensors"))
-        which = "training" if seed is not None and str(name).startswith(SHIPPED) else "file"
+        which = "training" if seed is not None and str(name).startswith(tuple(SHIPPED)) else "file"
         raise UserError(
             f"agent {name!s:.100}: no such {which} ({path!s:.200}); the agents that ship are "
             f"{', '.join(shipped)}; or give a path."

@@ -59,8 +59,7 @@ def realism(config: RealismConfig, folder: Path) -> str:
     set_threads(config.threads)
     path = scenes_path(config)
     # Everything that can be refused is refused before hours of driving.
-    traffics = traffics_on_card(config)
-    factories = {name: partial(_make, traffic, config.env) for name, traffic in traffics.items()}
+    factories = factories_on_card(config)
     files = files_wanted(config, path)
     starts = drive_from_starts(config, factories, path)
     # Empty without files of one lane; the card then leaves these rows out.
@@ -81,6 +80,12 @@ def realism(config: RealismConfig, folder: Path) -> str:
 def traffics_on_card(config: RealismConfig) -> dict[str, TrafficConfig]:
     """The card's traffic first, then its rivals."""
     return {config.traffic.label(): config.traffic, **config.rivals()}
+
+
+def factories_on_card(config: RealismConfig) -> dict[str, Factory]:
+    """What makes the card's traffics on a road, in their order."""
+    traffics = traffics_on_card(config)
+    return {name: partial(_make, traffic, config.env) for name, traffic in traffics.items()}
 
 
 def scenes_path(config: RealismConfig) -> Path | None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from ganlane.agents.checkpoint import SHIPPED
 from ganlane.errors import UserError
 from ganlane.evaluation.measures import CRASHES
 from ganlane.evaluation.rows import (
@@ -58,9 +59,9 @@ def recipe_of(driver: str) -> str:
 
 
 def seed_of(driver: str) -> int:
-    """3 of ``agent_idm@3+safe``; 0 where no seed is named: ``agent_idm`` is ``agent_idm@0``."""
+    """3 of ``agent_idm@3+safe``; that of a shipped agent where none is named, otherwise 0."""
     named = re.search(r"@(\d+)(?:\+|$)", driver)
-    return int(named[1]) if named else 0
+    return int(named[1]) if named else SHIPPED.get(driver.partition("+")[0], 0)
 
 
 def by_recipe(episodes: pl.DataFrame) -> dict[tuple[str, str], dict[str, pl.DataFrame]]:

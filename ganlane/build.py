@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,7 +21,7 @@ from ganlane import keys
 from ganlane.agents import load_agent
 from ganlane.agents.checkpoint import SHIPPED, check_observation_size, names_agent, with_seeds
 from ganlane.agents.drivers import DRIVERS, FunctionPolicy, MaskedPolicy
-from ganlane.agents.stored_models import SHIPPED_MODELS, load_model
+from ganlane.agents.stored_models import SHIPPED_MODELS, Reading, load_model
 from ganlane.arguments import call_with, import_target, imported, is_function_path, is_import_path
 from ganlane.env import HighwayEnv, TransformedHighway
 from ganlane.errors import ParameterError, UserError
@@ -223,11 +223,10 @@ def make_driver(
     if names_agent(name):
         # Only the metadata tell which observation the agent needs.
         network, metadata = load_agent(name, device=device)
-        observation = observation_of(metadata)
-        actions = actions_of(metadata)
-        size = observation_size(observation.form, env.vehicles, actions)
+        reading = reading_of(metadata)
+        size = observation_size(reading.observation.form, env.vehicles, reading.actions)
         check_observation_size(name, network.network.config, size)
-        return Driver(name, network, observation, mask_of(metadata), actions)
+        return Driver(name, network, reading.observation, reading.mask, reading.actions)
     # a model of stable-baselines3, by its weights
     stored = CHECKPOINTS / f"{name}.zip" if name in SHIPPED_MODELS else Path(name)
     if stored.suffix == ".zip":
@@ -269,47 +268,22 @@ def make_drivers(
     return [make_driver(name, env, stream, device) for name in single_names]
 
 
-def mask_of(metadata: dict[str, Any]) -> MaskParameters | None:
-    """The mask that an agent was trained with; None for none.
+def reading_of(metadata: Mapping[str, Any]) -> Reading:
+    """What an agent reads and commands, from the metadata of its file.
+
+    Those of 0.3.0 name no actions: there were no others than the lane.
 
     Raises:
-        UserError: an unknown mask.
+        UserError: no observation, mask or actions, or unknown ones.
     """
     try:
+        scale = metadata["observation_scale"]
+        observation = ObservationConfig(form=metadata["observation"], **scale)
         mask = MaskParameters(**metadata["mask"])
-    except (KeyError, TypeError) as error:
+        actions = make(ActionParameters, metadata.get("env", {}).get("actions", {}))
+    except (KeyError, TypeError, AttributeError, ParameterError) as error:
         raise UserError(
-            f"the agent's metadata name no mask that is known here ({error}); train it again."
+            "the agent's metadata name no observation, mask and actions that are known here "
+            f"({error}); train it again or give another."
         ) from error
-    return None if mask.form == "none" else mask
-
-
-def actions_of(metadata: dict[str, Any]) -> ActionParameters:
-    """The actions that an agent was trained with; those of 0.3.0 had no others than the lane.
-
-    Raises:
-        UserError: unknown actions.
-    """
-    env = metadata.get("env")
-    stored = env.get("actions") if isinstance(env, dict) else None
-    try:
-        return make(ActionParameters, stored or {})
-    except ParameterError as error:
-        raise UserError(
-            f"the agent's metadata name no actions that are known here ({error}); train it again."
-        ) from error
-
-
-def observation_of(metadata: dict[str, Any]) -> ObservationConfig:
-    """The observation in an agent's metadata.
-
-    Raises:
-        UserError: no observation, or an unknown one.
-    """
-    try:
-        return ObservationConfig(form=metadata["observation"], **metadata["observation_scale"])
-    except (KeyError, TypeError) as error:
-        raise UserError(
-            f"the agent's metadata name no observation that is known here ({error}); train it "
-            "again or give another."
-        ) from error
+    return Reading(observation, None if mask.form == "none" else mask, actions=actions)

@@ -36,7 +36,7 @@ def help_text(command: str, kind: type[Record]) -> str:
     options = [f"  {group}\n{_options(group)}" for group in groups]
     return "\n\n".join(
         [
-            _purpose(command),
+            "\n".join(_comment(f"{command}.yaml")),
             "options (GROUP=NAME)\n" + "\n".join(options),
             "keys (KEY=VALUE, with the defaults)\n" + "\n".join(_keys(make(kind, data), 2)),
             _FLAGS,
@@ -44,24 +44,17 @@ def help_text(command: str, kind: type[Record]) -> str:
     )
 
 
-def _purpose(command: str) -> str:
-    """The comment at the head of the command's YAML file."""
-    lines = (conf_folder() / f"{command}.yaml").read_text(encoding="utf-8").splitlines()
+def _comment(file: str) -> list[str]:
+    """The lines of the comment at the head of a YAML file."""
+    lines = (conf_folder() / file).read_text(encoding="utf-8").splitlines()
     head = itertools.takewhile(lambda line: line.startswith("#"), lines)
-    return "\n".join(line.removeprefix("#").removeprefix(" ") for line in head)
+    return [line.removeprefix("#").removeprefix(" ") for line in head]
 
 
 def _options(group: str) -> str:
-    lines = [f"    {name:<20}{_summary(f'{group}/{name}.yaml')}" for name in option_names(group)]
-    return "\n".join(lines)
-
-
-def _summary(file: str) -> str:
-    """The first comment of a YAML file that is not a directive."""
-    lines = (conf_folder() / file).read_text(encoding="utf-8").splitlines()
-    # Lines with @package are for Hydra, not for readers.
-    comments = [line[1:].strip() for line in lines if line.startswith("#")]
-    return next((comment for comment in comments if not comment.startswith("@package")), "")
+    """A group's options, each with the first line of its file."""
+    names = option_names(group)
+    return "\n".join(f"    {name:<20}{_comment(f'{group}/{name}.yaml')[0]}" for name in names)
 
 
 def _keys(record: Record, indent: int) -> Iterator[str]:

@@ -22,7 +22,7 @@ from ganlane.agents import GreedyPolicy, Rainbow
 from ganlane.agents.checkpoint import SHIPPED, read_agent, save_agent, warm_start
 from ganlane.agents.drivers import legal_actions
 from ganlane.agents.network import load_parameters
-from ganlane.build import make_env, make_traffic, observation_of
+from ganlane.build import make_env, make_traffic, reading_of
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
 from ganlane.evaluation.results import flat, plain
@@ -198,7 +198,7 @@ def make_initial_agent(phase: Phase, resumes: bool) -> Rainbow:
     if phase.start is not None and not resumes:
         name = start_file(phase.start)
         weights, network, metadata = read_agent(name)
-        check_observation(name, observation_of(metadata), phase.config.observation)
+        check_observation(name, reading_of(metadata).observation, phase.config.observation)
         warm_start(agent, name, weights, network)
     return agent
 

@@ -12,7 +12,7 @@ from reference import processes
 from reference.refusals import user_error
 
 from ganlane.agents import read_agent, save_agent
-from ganlane.build import make_driver, observation_of
+from ganlane.build import make_driver, reading_of
 from ganlane.config.run import settings
 from ganlane.files import conf_folder
 from ganlane.runtime import has_compiler
@@ -134,7 +134,7 @@ def test_every_experiment_composes_and_fits_the_agent_that_it_starts_from(overri
     config = settings("train", overrides)
     if config.init.path is not None:
         name = start_file(config.init.path)
-        trained = observation_of(read_agent(name)[2])
+        trained = reading_of(read_agent(name)[2]).observation
         check_observation(name, trained, config.observation)
 
 

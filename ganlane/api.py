@@ -18,14 +18,12 @@ a class of your own or its import path. Keys of the environment may be given alo
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import polars as pl
-import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Transform, TransformedEnv
 
@@ -44,14 +42,14 @@ from ganlane.config.run import (
 from ganlane.errors import UserError, did_you_mean
 from ganlane.evaluation import evaluation_rows
 from ganlane.evaluation.results import Run, TrainingRun, plain
-from ganlane.runtime import kernel_threads, worker_number
+from ganlane.runtime import worker_number
 from ganlane.settings.commands import EvaluateConfig, highways
 from ganlane.settings.record import Record
 from ganlane.sim.random import Stream
 from ganlane.suite.driving import compare
 from ganlane.suite.run import drivers_of
 from ganlane.suite.run import run as run_suite
-from ganlane.torch_settings import set_threads
+from ganlane.torch_settings import torch_threads
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its record.
 Option: TypeAlias = str | Mapping[str, Any] | Record | type
@@ -165,7 +163,7 @@ def evaluate(
     config: EvaluateConfig = call_settings(
         "evaluate", {"traffics": traffics, "episodes": episodes, **keys}
     )
-    with _torch_threads(config.threads):
+    with torch_threads(config.threads):
         drivers = _drivers(
             agents, lambda name: build.make_drivers([name], config.env, config.device)
         )
@@ -205,7 +203,7 @@ def benchmark(
     """
     config = call_settings("benchmark", {"suite": suite, "quick": quick, **keys})
     home = _home("benchmark", folder)
-    with _torch_threads(), running(home, config):
+    with running(home, config):
         drivers = _drivers(policy, lambda name: drivers_of([name], config))
         run_suite(drivers, config, home)
     return _finished(home)
@@ -317,7 +315,7 @@ def render(
     config = call_settings("render", {"traffic": traffic, "out": out, **shown, **keys})
     # With no file to write named, the run gets a folder with its settings, as the command does.
     folder = new_folder("render") if out is None else Path(out).parent
-    with _torch_threads(), running(folder, config) if out is None else nullcontext():
+    with running(folder, config) if out is None else torch_threads(config.threads):
         line = function_of("render")(config, folder)
     # The line is 'film: PATH' or alike; a path may itself hold ': ', so only the first one counts.
     return Path(str(line).partition(": ")[2])
@@ -355,7 +353,7 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
                 "api.train() the folder of one, and resume=True."
             )
     config = call_settings(command, keys)
-    with _torch_threads(), running(home, config):
+    with running(home, config):
         function_of(command)(config, home)
     return _finished(home)
 
@@ -378,17 +376,3 @@ def _home(command: str, folder: str | Path | None) -> Path:
     if not isinstance(folder, str | Path) or "\0" in str(folder):
         raise UserError(f"folder={folder!r:.80}: expected a path, such as 'mine'.")
     return Path(folder)
-
-
-@contextmanager
-def _torch_threads(threads: int = 0) -> Iterator[None]:
-    """Set torch's threads as the commands do, and restore the caller's number afterwards."""
-    # In a notebook the number is the caller's, and further cells rely on it.
-    before = torch.get_num_threads()
-    token = kernel_threads.set(None)
-    set_threads(threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-        kernel_threads.reset(token)

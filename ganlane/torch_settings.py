@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import lru_cache, wraps
 from typing import Any, TypeVar
 
@@ -88,11 +88,19 @@ def check_default_device(device: str) -> None:
         )
 
 
-def set_threads(threads: int) -> None:
-    """Set the threads of torch and of the native kernel.
+@contextmanager
+def torch_threads(threads: int) -> Iterator[None]:
+    """Set the threads of torch and of the native kernel; in the end they are as before.
 
     0 means one for torch, the fastest for the batch sizes used here, and all usable cores for the
     kernel, whose threads wait for each other without computing.
     """
+    # In a notebook the number is the caller's, and further cells rely on it.
+    before = torch.get_num_threads()
     torch.set_num_threads(threads or 1)
-    kernel_threads.set(threads or usable_threads())
+    token = kernel_threads.set(threads or usable_threads())
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        kernel_threads.reset(token)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,8 @@ from ganlane import evaluation
 from ganlane.build import make_drivers
 from ganlane.evaluation.statistics import entries
 from ganlane.evaluation.table import show
-from ganlane.settings.commands import EvaluateConfig
+from ganlane.settings.commands import EvaluateConfig, RunConfig
 from ganlane.suite.driving import compare
-from ganlane.torch_settings import set_threads
 
 
 def evaluate(config: EvaluateConfig, folder: Path) -> str:
@@ -23,10 +21,9 @@ def evaluate(config: EvaluateConfig, folder: Path) -> str:
 
     The line that names the results.
     """
-    set_threads(config.threads)
     table = compare(make_drivers(config.agents, config.env, config.device), config)
     seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
-    return publish(table, folder, asdict(config), seeds)
+    return publish(table, folder, config, seeds)
 
 
 def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
@@ -51,7 +48,7 @@ def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
 def publish(
     table: pl.DataFrame,
     folder: Path,
-    config: Mapping[str, Any],
+    config: RunConfig,
     seeds: Mapping[str, Any],
     numbers: Mapping[str, Any] | None = None,
 ) -> str:
@@ -69,7 +66,7 @@ def publish(
     # A driver alone has nobody to be paired with.
     if paired:
         tables.append(evaluation.paired_table(paired))
-    show(*tables, columns=config.get("columns", "all"))
+    show(*tables, columns=config.columns)
     record: dict[str, Any] = {"rows": rows, "paired": paired}
     recorded = recorded_crashes(table)
     if recorded:

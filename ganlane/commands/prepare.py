@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +43,7 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
         **prepared.to_dict(),
         "wall_s": time.perf_counter() - begun,
     }
-    return f"results: {write_results(folder, numbers, asdict(config), {})}"
+    return f"results: {write_results(folder, numbers, config, {})}"
 
 
 def short_report(prepared: PooledStatistics) -> str:

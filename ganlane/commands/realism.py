@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -34,7 +34,6 @@ from ganlane.settings.recordings import RealismConfig
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road
-from ganlane.torch_settings import set_threads
 from ganlane.traffic import TrafficModule
 from ganlane.weights import load_weights
 
@@ -56,7 +55,6 @@ def realism(config: RealismConfig, folder: Path) -> str:
             and are not there.
     """
     config = config.shortened()
-    set_threads(config.threads)
     path = scenes_path(config)
     # Everything that can be refused is refused before hours of driving.
     factories = factories_on_card(config)
@@ -74,7 +72,7 @@ def realism(config: RealismConfig, folder: Path) -> str:
     draw(numbers, starts, folder)
     show(*card_text(numbers), columns=config.columns)
     seeds = {"stream": "report", "seed": config.seed}
-    return f"results: {write_results(folder, numbers, asdict(config), seeds)}"
+    return f"results: {write_results(folder, numbers, config, seeds)}"
 
 
 def traffics_on_card(config: RealismConfig) -> dict[str, TrafficConfig]:

@@ -28,7 +28,6 @@ from ganlane.keys import ACTION, END_EVENTS, EPISODE
 from ganlane.settings.commands import RecordConfig
 from ganlane.settings.record import plain
 from ganlane.sim.random import Stream
-from ganlane.torch_settings import set_threads
 
 try:
     import minari
@@ -47,7 +46,6 @@ _ARGUMENTS = ("traffic", "env", "observation", "reward", "mask", "stream")
 
 def record(config: RecordConfig, folder: Path) -> str:
     """Drive the episodes and write them; the line that names the dataset."""
-    set_threads(config.threads)
     # The stream decides which episodes are driven; a random driver draws from it, too.
     driver = make_driver(config.driver, config.env, Stream.named(config.stream), config.device)
     # A trained agent reads the observation that it was trained with, whatever the command says.
@@ -81,7 +79,7 @@ def record(config: RecordConfig, folder: Path) -> str:
         )
         facts = _write(storage, _episodes(rows, policy, config), config.episodes)
     seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
-    write_results(folder, {"dataset": name, "root": str(root), **facts}, plain(config), seeds)
+    write_results(folder, {"dataset": name, "root": str(root), **facts}, config, seeds)
     print(", ".join(f"{key.replace('_', ' ')} {value}" for key, value in facts.items()))
     return f"dataset: minari.load_dataset({name!r}) with MINARI_DATASETS_PATH={root}"
 

@@ -8,7 +8,6 @@ from ganlane.build import make_driver
 from ganlane.settings.render import FILMS, RenderConfig
 from ganlane.sim.random import Stream
 from ganlane.suite.episodes import drive_episode
-from ganlane.torch_settings import set_threads
 from ganlane.view import write_film, write_player, write_tracks
 from ganlane.view.curves import draw_runs, read_runs
 from ganlane.view.figures import save_figure
@@ -21,7 +20,6 @@ def render(config: RenderConfig, folder: Path) -> str:
     if config.run is not None:
         out = Path(config.out or folder / f"curves.{kind}")
         return f"curves: {save_figure(draw_runs(read_runs(config.run)), out)}"
-    set_threads(config.threads)
     episodes = []
     for agent, number in config.pairs():
         end_s = config.look.end_s

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
 from ganlane.build import make_driver, make_drivers, make_traffic
@@ -12,7 +11,6 @@ from ganlane.config.run import Stopped, earned
 from ganlane.errors import UserError
 from ganlane.settings.train import TrainConfig
 from ganlane.suite.driving import compare
-from ganlane.torch_settings import set_threads
 from ganlane.training.checkpoint import LAST
 from ganlane.training.phases import AGENT_FILE, length_if_finished, phases_of, run_phase
 
@@ -26,7 +24,6 @@ def train(config: TrainConfig, folder: Path) -> str:
         raise UserError(
             f"{folder}: a run is there already; go on with resume={folder}, or give another folder."
         )
-    set_threads(config.threads)
     # a mistake in any of them shows before hours of training, not after
     for traffic in config.all_traffic():
         make_traffic(traffic, config.env)
@@ -58,4 +55,4 @@ def train(config: TrainConfig, folder: Path) -> str:
         "episodes": [0, config.evaluation.episodes - 1],
     }
     numbers = {**lengths["train"], "phases": lengths, "agent": agent}
-    return publish(table, folder, asdict(config), seeds, numbers)
+    return publish(table, folder, config, seeds, numbers)

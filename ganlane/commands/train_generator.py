@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from ganlane.generator import Progress
 from ganlane.generator.forecasts import BASELINE, SAMPLES
 from ganlane.settings.generator import HumanConfig
 from ganlane.settings.recordings import TrainGeneratorConfig
-from ganlane.torch_settings import set_threads
 
 #: Headings and rows of a table.
 Lines = list[list[str]]
@@ -29,7 +28,6 @@ Lines = list[list[str]]
 
 def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     """Read the recordings, fit, print the errors on held-out scenes, save weights and results."""
-    set_threads(config.threads)
     source = recordings_path(config.data)
     with byte_progress("read") as read:
         frame = read_recordings(config.data.format, source, config.data.parameters(), read)
@@ -87,7 +85,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
         "weights": str(weights),
     }
     context = {"seed": config.seed, "held_out": held_out}
-    used = asdict(replace(config, generator=fit_config))
+    used = replace(config, generator=fit_config)
     return f"results: {write_results(folder, numbers, used, context)}"
 
 

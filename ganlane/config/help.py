@@ -48,7 +48,9 @@ def _comment(file: str) -> list[str]:
     """The lines of the comment at the head of a YAML file."""
     lines = (conf_folder() / file).read_text(encoding="utf-8").splitlines()
     head = itertools.takewhile(lambda line: line.startswith("#"), lines)
-    return [line.removeprefix("#").removeprefix(" ") for line in head]
+    # Lines with @package are for Hydra, not for readers.
+    texts = (line.removeprefix("#").removeprefix(" ") for line in head)
+    return [text for text in texts if not text.startswith("@package")]
 
 
 def _options(group: str) -> str:

@@ -39,7 +39,7 @@ from ganlane.config.compose import (
 )
 from ganlane.config.help import help_text
 from ganlane.errors import USER_ERROR, UserError, as_typed, numbered_refusals
-from ganlane.files import conf_folder, remove_leftovers, write_bytes
+from ganlane.files import remove_leftovers, write_bytes
 from ganlane.runtime import (
     check_process,
     keep_freed_memory,
@@ -107,9 +107,7 @@ def run_command(command: str, arguments: Sequence[str] | None = None) -> int:
     keep_freed_memory()
     try:
         with _sigterm_as_exception():
-            single = _single_run(command, words)
-            if single is not None:
-                _run(command, *single)
+            _do(command, words)
             # Here, so that a reader who has left is noticed while it can still be reported.
             sys.stdout.flush()
     except UserError as error:
@@ -133,31 +131,31 @@ def _run(command: str, config: Any, folder: Path) -> None:
     print(line, flush=True)
 
 
-def _single_run(command: str, words: list[str]) -> tuple[Any, Path] | None:
-    """The settings and folder of the run that the words ask for.
+def _do(command: str, words: list[str]) -> None:
+    """What the words ask for: help, the configuration, a sweep, or a run.
 
-    None where they ask for something else, which is done here: help, the configuration, a sweep.
+    Raises:
+        UserError: a flag that there is not, or a mistake in the settings.
     """
     # Hydra would have a score of flags; these three are all that is needed.
     flags = [word for word in words if word.startswith("-")]
     keys = [word for word in words if word not in flags]
     if {"-h", "--help"} & set(flags):
         print(help_text(command, COMMANDS[command]))
-        return None
-    if flags == ["--cfg"] and "job" in keys:
+    elif flags == ["--cfg"] and "job" in keys:
         keys.remove("job")
         print(as_yaml(settings(command, keys)), end="")
-        return None
-    unknown = [flag for flag in flags if flag not in ("-m", "--multirun")]
-    if unknown:
-        raise UserError(f"{unknown[0]}: no such flag; run the command with --help to see them.")
-    check_process()
-    overrides = parsed(command, keys)
-    if flags:
-        _sweep(command, overrides)
-        return None
-    config, folder = _settings_and_folder(command, overrides)
-    return config, folder.absolute()
+    elif set(flags) <= {"-m", "--multirun"}:
+        check_process()
+        overrides = parsed(command, keys)
+        if flags:
+            _sweep(command, overrides)
+        else:
+            config, folder = _settings_and_folder(command, overrides)
+            _run(command, config, folder.absolute())
+    else:
+        unknown = next(flag for flag in flags if flag not in ("-m", "--multirun"))
+        raise UserError(f"{unknown}: no such flag; run the command with --help to see them.")
 
 
 def settings(command: str, words: Sequence[str]) -> Any:
@@ -297,7 +295,7 @@ def as_yaml(config: Record) -> str:
 
 @contextmanager
 def running(folder: Path, config: Any) -> Iterator[None]:
-    """The run folder for the time of a run: locked, with the settings in it.
+    """What holds for the time of a run: its folder is locked, the settings in it, threads are set.
 
     Raises:
         UserError: another run uses the folder.
@@ -305,7 +303,9 @@ def running(folder: Path, config: Any) -> Iterator[None]:
     register_envs()  # for a user's own driver or traffic
     with cleared_after_mistakes(folder), held(folder):
         write_bytes(folder / CONFIG, as_yaml(config).encode())
-        with numbered_refusals():
+        from ganlane.torch_settings import torch_threads  # torch takes seconds
+
+        with numbered_refusals(), torch_threads(config.threads):
             yield
 
 

@@ -64,7 +64,7 @@ class TrainingRun(Run):
 def write_results(
     folder: str | Path,
     numbers: Mapping[str, Any],
-    config: Mapping[str, Any],
+    config: Any,
     seeds: Mapping[str, Any],
 ) -> Path:
     """Write ``results.json`` into ``folder`` atomically and return its path.
@@ -72,7 +72,7 @@ def write_results(
     Args:
         folder: of the run.
         numbers: the command's own results, for instance ``{"rows": evaluation_rows(...)}``.
-        config: the whole configuration.
+        config: the record of the command's settings.
         seeds: the seeds and episode numbers behind the numbers.
     """
     path = Path(folder) / "results.json"

@@ -26,10 +26,3 @@ Modules, from the bottom up:
 - :mod:`~ganlane.realism.card`: a card's numbers.
 - :mod:`~ganlane.realism.sheets`: the same as tables and figures.
 """
-
-from functools import partial
-
-from ganlane.config.run import run_command
-
-#: Entry point; takes the arguments of the command line, and returns the exit status.
-main = partial(run_command, "realism")

@@ -28,7 +28,6 @@ from ganlane.settings.record import (
     key_names,
     make,
     part_of,
-    plain,
 )
 
 ImportPath = Annotated[str, Rule(is_import_path, "an import path such as my.module.MyTraffic")]
@@ -104,10 +103,6 @@ class TrafficConfig(Record):
     def parts(self) -> dict[str, TrafficConfig]:
         """Traffics that the target is made of, by name; it is given their models as ``parts``."""
         return {}
-
-    def description(self) -> dict[str, Any]:
-        """Plain data by which a run is recognised."""
-        return plain(self)
 
 
 @dataclass(frozen=True)

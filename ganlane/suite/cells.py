@@ -25,6 +25,7 @@ from ganlane.errors import UserError
 from ganlane.evaluation import code_version
 from ganlane.files import opened
 from ganlane.settings.commands import EvaluateConfig
+from ganlane.settings.record import plain
 from ganlane.settings.suite import BenchmarkConfig
 from ganlane.suite.driving import compare
 
@@ -99,7 +100,7 @@ def _settings(driver: Driver, config: EvaluateConfig) -> dict[str, Any]:
         **settings,
         "driver": driver.name,
         "weights": weights.hexdigest(),
-        "traffics": {name: item.description() for name, item in config.traffics.items()},
+        "traffics": {name: plain(item) for name, item in config.traffics.items()},
     }
 
 

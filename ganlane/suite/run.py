@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from ganlane.sim.random import Stream
 from ganlane.suite import report, scores
 from ganlane.suite.cells import available, cells_of, drive
 from ganlane.suite.episodes import drive_episode
-from ganlane.torch_settings import set_threads
 from ganlane.view import Trajectory
 from ganlane.view.player import player_page
 
@@ -63,7 +61,6 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
 
     The line that names them.
     """
-    set_threads(config.threads)
     suite = config.suite
     traffics, left_out = available(config)
     for name, reason in left_out.items():
@@ -118,7 +115,7 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
         "left_out": left_out,
     }
     seeds = {"stream": suite.stream, "seed": config.seed, "episodes": driven}
-    return f"report: {page}; results: {write_results(folder, record, asdict(config), seeds)}"
+    return f"report: {page}; results: {write_results(folder, record, config, seeds)}"
 
 
 def _sample(episodes: pl.DataFrame, traffics: Sequence[str]) -> dict[str, Any]:

@@ -89,7 +89,7 @@ def length_if_finished(phase: Phase) -> dict[str, float] | None:
             f"pretrain.total_decisions={wanted}: this phase is over, after {done} decisions; "
             "resume with the value that the run was started with."
         )
-    if flat(training["traffic"]) != flat(phase.config.traffic.description()):
+    if flat(training["traffic"]) != flat(plain(phase.config.traffic)):
         raise UserError(
             "traffic@pretrain.traffic: this phase is over, on other traffic; resume with the same."
         )
@@ -248,7 +248,7 @@ def identity(config: TrainConfig) -> dict[str, Any]:
     """The settings that a resumed run must share with the run that was stopped."""
     return {
         "env": plain(config.env),
-        "traffic": config.traffic.description(),
+        "traffic": plain(config.traffic),
         "observation": asdict(config.observation),
         "reward": asdict(config.reward),
         "mask": asdict(config.mask),
@@ -276,6 +276,6 @@ def describe(phase: Phase) -> dict[str, Any]:
             "phase": phase.name,
             "init": phase.start,
             "seed": config.seed,
-            "traffic": config.traffic.description(),
+            "traffic": plain(config.traffic),
         },
     }

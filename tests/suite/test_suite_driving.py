@@ -8,6 +8,7 @@ import ganlane
 from ganlane.commands.evaluate import publish
 from ganlane.evaluation import crashes_by_scene, evaluation_rows, failed_episodes, paired_rows
 from ganlane.evaluation.results import plain
+from ganlane.settings.commands import EvaluateConfig
 from ganlane.sim.random import Stream
 from ganlane.traffic import ReplayTraffic
 
@@ -29,7 +30,7 @@ def test_every_replayed_episode_has_the_scene_that_it_ran_in(table, three_scenes
 
 
 def test_the_record_holds_rows_paired_leads_failures_and_crashes_by_scene(table, tmp_path, capsys):
-    publish(table, tmp_path, {}, {})
+    publish(table, tmp_path, EvaluateConfig(columns="all"), {})
     record = json.loads((tmp_path / "results.json").read_text())
     assert record["rows"] == plain(evaluation_rows(table))
     assert record["paired"] == plain(paired_rows(table))
@@ -44,5 +45,5 @@ def test_the_record_holds_rows_paired_leads_failures_and_crashes_by_scene(table,
 
 
 def test_other_traffics_have_no_scenes(table, tmp_path):
-    publish(table.filter(traffic="idm").drop("scene"), tmp_path, {}, {})
+    publish(table.filter(traffic="idm").drop("scene"), tmp_path, EvaluateConfig(columns="all"), {})
     assert "crashes_by_scene" not in json.loads((tmp_path / "results.json").read_text())

@@ -78,7 +78,8 @@ def test_sudden_accelerations_fill_a_third_of_the_time_with_the_spread_of_the_da
     overlay = AccelerationOverlay(sudden=sudden)
     state = HighwayEnv(IdmTraffic(), num_envs=200).reset()
     state["vehicles", "speed"][:] = 20.0
-    state["traffic"] = overlay.init_memory(Vehicles.of(state["vehicles"]), state["episode"])
+    episode = state["episode"]
+    _, state["traffic"] = overlay.enter(Vehicles.of(state["vehicles"]), episode, episode)
     record = []
     for step in range(300):
         state["step"] = torch.full((200,), step)

@@ -255,9 +255,10 @@ def _vehicle(values: Any, where: str, origin: str) -> SceneVehicle:
             raise UserError(f"{where}: x_m: no value; give the position along the road in m.")
         kinds = {kind.name.lower(): kind for kind in Visibility}
         seen = values.get("visibility")
-        if seen is not None and (not isinstance(seen, str) or seen not in kinds):
-            raise UserError(
-                f"{where}: visibility={as_typed(seen):.60}: expected one of {', '.join(kinds)}."
-            )
-        values = values | {"visibility": kinds.get(seen)}
+        if seen is not None:
+            if not isinstance(seen, str) or seen not in kinds:
+                raise UserError(
+                    f"{where}: visibility={as_typed(seen):.60}: expected one of {', '.join(kinds)}."
+                )
+            values = values | {"visibility": kinds[seen]}
     return replace(_made(SceneVehicle, values, where), origin=origin)

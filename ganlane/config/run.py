@@ -39,7 +39,7 @@ from ganlane.config.compose import (
 )
 from ganlane.config.help import help_text
 from ganlane.errors import USER_ERROR, UserError, as_typed, numbered_refusals
-from ganlane.files import remove_leftovers, write_bytes
+from ganlane.files import conf_folder, remove_leftovers, write_bytes
 from ganlane.runtime import (
     check_process,
     keep_freed_memory,

@@ -328,7 +328,7 @@ class HighwayEnv(EnvBase):
         start, command = begin(rules, action, vehicles, ego, state.get(keys.STEP))
         end, memory = run_decision(self.traffic, rules, state, start, key, self.recorder)
         ego = remember(rules, ego, start, end, command)
-        events, rest = outcome(rules, end)
+        events, rest = outcome(end)
         rest |= {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
         rest[keys.STEP] = end.step
         if self.traffic.own_roads:

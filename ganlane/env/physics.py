@@ -43,6 +43,8 @@ from ganlane.traffic.base import TrafficModule, memory_of, new_tensordict, where
 
 #: Fields of the state by their names (:mod:`ganlane.env.state`), [N] or [N, 1].
 Fields = dict[str, Tensor]
+#: In place of the number of an event of :data:`ganlane.keys.END_EVENTS`: the episode goes on.
+RUNNING = -1
 #: Called after every physics step with the vehicles and the rows [N] that were running in it.
 Recorder = Callable[[Vehicles, Tensor], None]
 
@@ -62,19 +64,13 @@ class Rules(NamedTuple):
     scene_steps: Tensor | None = None
 
 
-def scene_over(rules: Rules, step: Tensor) -> Tensor:
-    """Whether the recorded scene has ended at physics step ``step``, bool [N]."""
-    if rules.scene_steps is None:
-        return torch.zeros_like(step, dtype=torch.bool)
-    return step >= rules.scene_steps
-
-
 class Substep(NamedTuple):
     """State between two physics steps of a decision; fields [N] except the vehicles [N, M].
 
     ``acceleration`` is the ego's for the next step, m/s2, ``line`` the one that it steers to, m.
     ``ahead`` and ``behind`` are its soft
-    crashes, ``onsets`` counts their beginnings.
+    crashes, ``onsets`` counts their beginnings. ``end`` is the number of the event that has ended
+    the episode in :data:`ganlane.keys.END_EVENTS`, or :data:`RUNNING`.
     """
 
     vehicles: Vehicles
@@ -84,13 +80,14 @@ class Substep(NamedTuple):
     ahead: Tensor
     behind: Tensor
     step: Tensor
-    running: Tensor
     onsets: Tensor
     onsets_behind: Tensor
-    out_of_road: Tensor
-    hard_crash: Tensor
-    goal: Tensor
-    missed_exit: Tensor
+    end: Tensor
+
+    @property
+    def running(self) -> Tensor:
+        """Whether the episode of each row goes on, bool [N]."""
+        return self.end == RUNNING
 
 
 def begin(
@@ -123,7 +120,7 @@ def begin(
         scene = ego_scene(vehicles, road)
         acceleration = following_acceleration(scene, rules.idm)[:, 0]
         acceleration = before_change(rules, scene, acceleration)
-    none = torch.zeros_like(command.off_road)
+    none = torch.zeros_like(step)
     start = Substep(
         vehicles=vehicles,
         acceleration=acceleration,
@@ -132,13 +129,9 @@ def begin(
         ahead=ego["soft_crash"],
         behind=ego["soft_crash_behind"],
         step=step,
-        running=~command.off_road,
-        onsets=none.long(),
-        onsets_behind=none.long(),
-        out_of_road=command.off_road,
-        hard_crash=none,
-        goal=none,
-        missed_exit=none,
+        onsets=none,
+        onsets_behind=none,
+        end=torch.where(command.off_road, keys.END_EVENTS.index("out_of_road"), RUNNING),
     )
     return start, command
 
@@ -159,21 +152,43 @@ def with_ego(number: Tensor, numbers: Tensor) -> Tensor:
     return torch.cat((number[:, None], numbers[:, 1:]), dim=1)
 
 
-def arrived(rules: Rules, ego: Vehicles) -> tuple[Tensor, Tensor]:
-    """Whether the ego has reached its goal, and whether it has missed its exit, each [N]."""
+def endings(
+    rules: Rules, before: Vehicles, vehicles: Vehicles, scene: Scene, step: Tensor
+) -> Fields:
+    """What may have ended an episode in the step from ``before`` to ``vehicles``, bool [N] by name.
+
+    The first that is true is the reason: a hard crash has precedence over leaving the road, that
+    over goal and missed exit, and all over the time-out.
+
+    Args:
+        scene: of the ego.
+        step: physics steps of the episode, [N].
+    """
+    road = rules.road
+    crash = ego_overlaps(vehicles, road).any(-1)
+    if road.has_lane_ends:
+        crash = crash | hits_wall(scene.observers, scene.body, road)[:, 0]
+    events = {"hard_crash": crash}
+    if rules.actions.form == CONTINUOUS:
+        # Where the lane itself is commanded, the command alone can leave the road.
+        y, new_y, x = (field[:, :1] for field in (before.y, vehicles.y, vehicles.x))
+        events["out_of_road"] = leaves_road(road, y, new_y, x)[:, 0]
+    ego = vehicles.at(EGO_INDEX)
     # On a road with an exit that is the goal, wherever it is.
-    if rules.road.exit_lane is not None:
-        return at_exit(ego, rules.road)
-    goal = ego.x >= rules.episode.goal_m
-    return goal, torch.zeros_like(goal)
+    if road.exit_lane is None:
+        events["goal"] = ego.x >= rules.episode.goal_m
+    else:
+        events["goal"], events["missed_exit"] = at_exit(ego, road)
+    if rules.scene_steps is not None:
+        events["scene_end"] = step >= rules.scene_steps
+    events["timeout"] = step >= round(rules.episode.timeout_s / PHYSICS_STEP_S)
+    return events
 
 
 def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -> Substep:
     """One physics step in which the others have ``moved``: moves the ego and finds the events.
 
-    A hard crash has precedence over leaving the road, that over goal and missed exit, and all over
-    the time-out. With
-    ``all_running`` no row has ended, which saves the copies that keep ended rows as they are.
+    With ``all_running`` no row has ended, which saves the copies that keep ended rows as they are.
     """
     ego, steering = drive(
         before.vehicles.at(EGO_INDEX),
@@ -194,21 +209,10 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
     acceleration = before_change(rules, scene, acceleration)
     if rules.actions.form == CONTINUOUS:
         acceleration = before.acceleration
-    # Of the events of one step a crash comes first, then the goal, then the time-out.
-    crash = ego_overlaps(vehicles, rules.road).any(-1) & running
-    if rules.road.has_lane_ends:
-        crash = crash | (hits_wall(scene.observers, scene.body, rules.road)[:, 0] & running)
-    going_on = running & ~crash
-    out_of_road = before.out_of_road
-    if rules.actions.form == CONTINUOUS:
-        # Where the lane itself is commanded, the command alone can leave the road.
-        y, new_y, x = (field[:, :1] for field in (before.vehicles.y, vehicles.y, vehicles.x))
-        left = leaves_road(rules.road, y, new_y, x)[:, 0] & going_on
-        out_of_road = out_of_road | left
-        going_on = going_on & ~left
-    goal, missed = (event & going_on for event in arrived(rules, vehicles.at(EGO_INDEX)))
     step = before.step + running
-    late = (step >= round(rules.episode.timeout_s / PHYSICS_STEP_S)) | scene_over(rules, step)
+    end = before.end
+    for name, happens in endings(rules, before.vehicles, vehicles, scene, step).items():
+        end = torch.where((end == RUNNING) & happens, keys.END_EVENTS.index(name), end)
     return Substep(
         vehicles=vehicles,
         acceleration=acceleration,
@@ -217,14 +221,10 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
         ahead=torch.where(running, ahead, before.ahead),
         behind=torch.where(running, behind, before.behind),
         step=step,
-        running=going_on & ~(goal | missed | late),
         # A soft crash counts when it begins, however long it lasts.
         onsets=before.onsets + (ahead & ~before.ahead & running),
         onsets_behind=before.onsets_behind + (behind & ~before.behind & running),
-        out_of_road=out_of_road,
-        hard_crash=before.hard_crash | crash,
-        goal=before.goal | goal,
-        missed_exit=before.missed_exit | missed,
+        end=end,
     )
 
 
@@ -257,24 +257,14 @@ def remember(
     return memory
 
 
-def outcome(rules: Rules, end: Substep) -> tuple[Fields, Fields]:
+def outcome(end: Substep) -> tuple[Fields, Fields]:
     """Events and done flags of a decision, each [N, 1]; every end has exactly one reason."""
-    # Outcomes of the driving.
-    terminated = end.goal | end.hard_crash | end.missed_exit | end.out_of_road
-    # What has ended without an outcome was cut off: by the clock, or where its recording stops.
-    truncated = ~end.running & ~terminated
-    scene_end = truncated & scene_over(rules, end.step)
-    events = {
-        "goal": end.goal,
-        "hard_crash": end.hard_crash,
-        "out_of_road": end.out_of_road,
-        "missed_exit": end.missed_exit,
-        "timeout": truncated & ~scene_end,
-        "scene_end": scene_end,
-        keys.SOFT_CRASH: end.onsets,
-        keys.SOFT_CRASH_BEHIND: end.onsets_behind,
-    }
-    flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+    events = {name: end.end == number for number, name in enumerate(keys.END_EVENTS)}
+    events |= {keys.SOFT_CRASH: end.onsets, keys.SOFT_CRASH_BEHIND: end.onsets_behind}
+    # After the outcomes of the driving come the cut-offs.
+    done = ~end.running
+    truncated = end.end >= len(keys.TERMINAL_EVENTS)
+    flags = {"terminated": done & ~truncated, "truncated": truncated, "done": done}
     return _columns(events), _columns(flags)
 
 

@@ -34,7 +34,7 @@ from torch.nn.functional import pad
 from ganlane import keys
 from ganlane.data.dense import Recording
 from ganlane.generator.closed_loop import balanced_headway
-from ganlane.sim.random import Purpose, absorb, episode_key, uniform
+from ganlane.sim.random import Purpose, episode_key, uniform
 from ganlane.sim.state import ENTRY_M, Road, Vehicles
 from ganlane.traffic.base import Memory, Moved, TrafficModule, new_tensordict, uniforms
 from ganlane.traffic.overlays import random_side
@@ -127,7 +127,7 @@ def _drive(
     state = recorded.entering(0, excess, traffic)
     waiting = state.valid
     state = state.with_(x=torch.full_like(state.x, _ABSENT_M), valid=~waiting)
-    memory: TensorDictBase = traffic.init_memory(state, absorb(key, 0))
+    _, memory = traffic.enter(state, key, counters[keys.EPISODE])
     # Positions of every step, before the step is driven.
     course = []
     for step in range(len(recorded.x)):
@@ -138,9 +138,8 @@ def _drive(
         state = recorded.entering(step, excess, traffic).where(enters, state)
         if bool(enters.any()):
             # Drawn for all, and taken for those who enter.
-            fresh = with_recorded_headways(
-                traffic.init_memory(state, absorb(key, 0)), state, traffic.road, enters
-            )
+            _, fresh = traffic.enter(state, key, counters[keys.EPISODE])
+            fresh = with_recorded_headways(fresh, state, traffic.road, enters)
             memory = fresh.apply(partial(_of_those, enters), memory)
         course.append((state.x, state.y, state.valid))
         state, memory = step_traffic(traffic, state, memory, counters, step)

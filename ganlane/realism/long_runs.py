@@ -23,7 +23,7 @@ from ganlane.realism.driving import Factory, print_progress, step_traffic
 from ganlane.realism.measures import rate_entries
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.neighbours import leader, perceive
-from ganlane.sim.random import absorb, episode_key
+from ganlane.sim.random import episode_key
 from ganlane.sim.spawn import TABLE_II, RandomScenes, SpawnParameters
 from ganlane.sim.state import Road, Vehicles, lateral_half_extent
 from ganlane.traffic import TrafficModule
@@ -219,7 +219,7 @@ def drive_spawned(
     # Numbers go on from batch to batch, so that no episode is driven twice.
     key = episode_key(traffic.stream, *counters.values())
     state = spawned_vehicles(traffic, parameters, key)
-    memory = traffic.init_memory(state, absorb(key, 0))
+    _, memory = traffic.enter(state, key, counters[keys.EPISODE])
     course = [(state.x, state.y, state.speed)]
     start = state.x
     # Onsets do not carry over from the batch before.

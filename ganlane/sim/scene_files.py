@@ -16,26 +16,34 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from ganlane.errors import ParameterError, UserError
+from ganlane.errors import ParameterError, UserError, as_typed
 from ganlane.settings.driving import Visibility
-from ganlane.settings.record import make
+from ganlane.settings.record import Count, Positive, Record, key_names, make
 from ganlane.settings.road import LaneStretch, Stretches
-from ganlane.sim.scenes import FixedScene, SceneVehicle, check_count
+from ganlane.sim.scenes import FixedScene, SceneVehicle, SceneVehicles, check_count
 from ganlane.sim.state import Road
 
+Made = TypeVar("Made")
 #: Columns of a scene file.
-COLUMNS = tuple(field.name for field in fields(SceneVehicle) if field.name != "origin")
-ROAD = ("lanes", "lane_width_m")
-WHOLE_NUMBERS = ("lane", "target_lane", "lanes")
+COLUMNS = key_names(SceneVehicle)
 LANE_WIDTH_M = 4.0
-#: Larger files hold no scene, bytes; and so many signs of a value are quoted in a message.
+#: Larger files hold no scene, bytes.
 _MOST_BYTES = 2**24
-_QUOTED = 60
+
+
+@dataclass(frozen=True)
+class SceneFile(Record):
+    """What a file says of a scene; None and empty: nothing."""
+
+    vehicles: SceneVehicles
+    lanes: Count | None = None
+    lane_width_m: Positive | None = None
+    stretches: Stretches = ()
 
 
 def read_scene(
@@ -54,23 +62,20 @@ def read_scene(
     """
     path = Path(path)
     text = _text(path, "a scene", (".csv", ".json"))
-    road: dict[str, Any] = {}
-    if path.suffix.lower() == ".csv":
-        rows = _read_csv(path, text)
-    else:
-        rows, road = _read_json(path, text)
+    file = _read_csv(path, text) if path.suffix.lower() == ".csv" else _read_json(path, text)
+    rows = file.vehicles
     # The file's numbers hold unless it gives none.
-    width = _agreed(path, "lane_width_m", road, lane_width_m) or LANE_WIDTH_M
-    stretches = road.get("stretches", ())
-    count = _agreed(path, "lanes", road, lanes) or len(stretches) or _lanes_in(rows, width)
-    if stretches and rows:
+    width = _agreed(path, "lane_width_m", file.lane_width_m, lane_width_m) or LANE_WIDTH_M
+    stretches = file.stretches
+    count = _agreed(path, "lanes", file.lanes, lanes) or len(stretches) or _lanes_in(rows, width)
+    if rows:
         # The ego starts at 0, wherever the file has it.
         stretches = tuple(stretch.seen_from(rows[0].x_m) for stretch in stretches)
     try:
-        whole = Road(int(count), float(width), stretches=stretches)
+        road = Road(int(count), float(width), stretches=stretches)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    return FixedScene(tuple(rows), whole, name=str(path))
+    return FixedScene(rows, road, name=str(path))
 
 
 def read_roads(path: str | Path) -> dict[str, Stretches]:
@@ -129,18 +134,33 @@ def _stretches(lanes: Any, where: str) -> Stretches:
     """The stretches of a road's lanes, from the right."""
     if not isinstance(lanes, list) or not lanes:
         raise UserError(f"{where}: expected a list with an object for each lane, from the right.")
-    stretches = []
-    for number, lane in enumerate(lanes):
-        try:
-            stretches.append(make(LaneStretch, lane))
-        except ParameterError as error:
-            raise UserError(f"{where}, lane {number}: {error}") from error
-    return tuple(stretches)
+    return tuple(
+        _made(LaneStretch, lane, f"{where}, lane {number}") for number, lane in enumerate(lanes)
+    )
 
 
-def _agreed(path: Path, name: str, road: Mapping[str, Any], wanted: float | None) -> Any:
+def _made(kind: type[Made], values: Any, where: str) -> Made:
+    """A record of what a file has at a place."""
+    if not isinstance(values, dict):
+        raise UserError(f"{where}: expected an object with {', '.join(key_names(kind))}.")
+    # Null is as no value.
+    numbers = {name: _number(value) for name, value in values.items() if value is not None}
+    try:
+        return make(kind, numbers)
+    except ParameterError as error:
+        raise UserError(f"{where}: {error}") from error
+
+
+def _number(value: Any) -> Any:
+    """The number that a text says (CSV has texts alone); all else as it is."""
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
+def _agreed(path: Path, name: str, in_file: float | None, wanted: float | None) -> float | None:
     """The value of the file or of the caller; an error if they differ."""
-    in_file = road.get(name)
     if in_file is not None and wanted is not None and in_file != wanted:
         raise UserError(
             f"{path}: {name} is {in_file:g} in the file and {wanted:g} was asked for; "
@@ -149,7 +169,7 @@ def _agreed(path: Path, name: str, road: Mapping[str, Any], wanted: float | None
     return wanted if in_file is None else in_file
 
 
-def _lanes_in(rows: list[SceneVehicle], lane_width_m: float) -> int:
+def _lanes_in(rows: Sequence[SceneVehicle], lane_width_m: float) -> int:
     """Just enough lanes for all vehicles and their target lanes."""
     highest = 0
     for row in rows:
@@ -161,7 +181,7 @@ def _lanes_in(rows: list[SceneVehicle], lane_width_m: float) -> int:
     return 1 + highest
 
 
-def _read_csv(path: Path, text: str) -> list[SceneVehicle]:
+def _read_csv(path: Path, text: str) -> SceneFile:
     lines = []
     # Numbers of lines count comments and empty lines too, as an editor does.
     for number, line in enumerate(text.split("\n"), 1):
@@ -175,7 +195,13 @@ def _read_csv(path: Path, text: str) -> list[SceneVehicle]:
     where, _, line = lines[0]
     # The first line that is no comment.
     header = _cells(line, where)
-    _check_names(header, where)
+    for name in header:
+        if name not in COLUMNS:
+            raise UserError(
+                f"{where}: unknown column {name!r:.60}; expected some of {', '.join(COLUMNS)}."
+            )
+        if header.count(name) > 1:
+            raise UserError(f"{where}: column {name} is given twice; remove one.")
     if "x_m" not in header or not {"lane", "y_m"} & set(header):
         raise UserError(
             f"{where}: columns x_m and lane (or y_m) are needed; the header has "
@@ -190,8 +216,8 @@ def _read_csv(path: Path, text: str) -> list[SceneVehicle]:
             )
         # An empty cell is as a column that is not there: the default.
         values = {name: cell for name, cell in zip(header, cells) if cell}
-        rows.append(_row(values, where, origin))
-    return rows
+        rows.append(_vehicle(values, where, origin))
+    return SceneFile(tuple(rows))
 
 
 def _cells(line: str, where: str) -> list[str]:
@@ -202,8 +228,7 @@ def _cells(line: str, where: str) -> list[str]:
         raise UserError(f"{where}: not a line of CSV ({error}); fix the line.") from error
 
 
-def _read_json(path: Path, text: str) -> tuple[list[SceneVehicle], dict[str, Any]]:
-    """The vehicles, and what the file says of the road."""
+def _read_json(path: Path, text: str) -> SceneFile:
     content = _json(path, text)
     # A bare list of vehicles is short for an object without a road.
     if isinstance(content, list):
@@ -213,78 +238,27 @@ def _read_json(path: Path, text: str) -> tuple[list[SceneVehicle], dict[str, Any
             f"{path}: expected a list of vehicles, or an object with 'vehicles'; "
             "see docs/scenarios.md."
         )
-    vehicles = content.pop("vehicles")
-    check_count(str(path), len(vehicles))
+    check_count(str(path), len(content["vehicles"]))
     rows = []
-    for number, vehicle in enumerate(vehicles, 1):
-        where = f"{path}: vehicles entry {number}"
-        if not isinstance(vehicle, dict):
-            raise UserError(f"{where}: expected an object with {', '.join(COLUMNS)}.")
-        _check_names(list(vehicle), where)
-        values = {name: value for name, value in vehicle.items() if value is not None}
-        rows.append(_row(values, where, f"entry {number}"))
-    # What is left are keys of the road.
-    road: dict[str, Any] = {}
+    for number, vehicle in enumerate(content["vehicles"], 1):
+        rows.append(_vehicle(vehicle, f"{path}: vehicles entry {number}", f"entry {number}"))
+    content["vehicles"] = rows
     if content.get("stretches") is not None:
-        road["stretches"] = _stretches(content.pop("stretches"), f"{path}: stretches")
-    for name in sorted(content):
-        if name not in ROAD:
-            raise UserError(
-                f"{path}: unknown key {_quoted(name)}; expected lanes, lane_width_m, stretches and "
-                "vehicles."
-            )
-    for name in ROAD:
-        if content.get(name) is not None:
-            road[name] = value = _value(name, content[name], f"{path}: {name}")
-            if not 0 < value < float("inf"):
-                raise UserError(f"{path}: {name}={value}: expected a finite number above 0.")
-    return rows, road
+        content["stretches"] = _stretches(content["stretches"], f"{path}: stretches")
+    return _made(SceneFile, content, str(path))
 
 
-def _check_names(names: Sequence[str], where: str) -> None:
-    """Check that column names are known and unique."""
-    for name in names:
-        if name not in COLUMNS:
-            unknown = _quoted(name) if name else "(empty)"
-            raise UserError(
-                f"{where}: unknown column {unknown}; expected some of {', '.join(COLUMNS)}."
-            )
-        if names.count(name) > 1:
-            raise UserError(f"{where}: column {name} is given twice; remove one.")
-
-
-def _row(values: Mapping[str, Any], where: str, origin: str) -> SceneVehicle:
+def _vehicle(values: Any, where: str, origin: str) -> SceneVehicle:
     """A vehicle from its values in a file."""
-    if "x_m" not in values:
-        raise UserError(f"{where}: column x_m: no value; give the position along the road in m.")
-    numbers = {}
-    for name, value in values.items():
-        numbers[name] = _value(name, value, f"{where}: column {name}")
-    return SceneVehicle(**numbers, origin=origin)
-
-
-def _value(name: str, value: Any, where: str) -> Any:
-    """A number, or a :class:`Visibility`, from what stands in a file."""
-    if name == "visibility":
+    if isinstance(values, dict):
+        if values.get("x_m") is None:
+            raise UserError(f"{where}: x_m: no value; give the position along the road in m.")
         kinds = {kind.name.lower(): kind for kind in Visibility}
-        if not isinstance(value, str) or value not in kinds:
-            raise UserError(f"{where}: {_quoted(value)}: expected one of {', '.join(kinds)}.")
-        return kinds[value]
-    # CSV has texts, JSON numbers: both go through float.
-    whole = name in WHOLE_NUMBERS
-    try:
-        if isinstance(value, bool):  # JSON's true, which Python takes for a 1
-            raise ValueError
-        number = float(value)
-        if whole and number != int(number):
-            raise ValueError
-    except (TypeError, ValueError, OverflowError):
-        kind = "a whole number" if whole else "a number"
-        raise UserError(f"{where}: {_quoted(value)}: expected {kind}.") from None
-    return int(number) if whole else number
-
-
-def _quoted(value: Any) -> str:
-    """The value in a message, cut where it is long."""
-    text = repr(value)
-    return text if len(text) <= _QUOTED else f"{text[:_QUOTED]}..."
+        seen = values.get("visibility")
+        if seen is not None:
+            if not isinstance(seen, str) or seen not in kinds:
+                raise UserError(
+                    f"{where}: visibility={as_typed(seen):.60}: expected one of {', '.join(kinds)}."
+                )
+            values = values | {"visibility": kinds[seen]}
+    return replace(_made(SceneVehicle, values, where), origin=origin)

@@ -18,6 +18,7 @@ from torch import Tensor
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import IdmParameters, Visibility
+from ganlane.settings.record import NO_KEY, Record
 from ganlane.settings.road import NOTHING
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.dynamics import drive
@@ -66,10 +67,10 @@ class Scenes(Protocol):
 
 
 @dataclass(frozen=True)
-class SceneVehicle:
+class SceneVehicle(Record):
     """One vehicle of a hand-made scene. m, m/s.
 
-    Args:
+    Attributes:
         x_m: centre of the body along the road; only distances matter, since the scene is shifted to
             ego x = 0.
         lane: the vehicle is at the centre of this lane, 0 the rightmost; may be left out if ``y_m``
@@ -77,8 +78,8 @@ class SceneVehicle:
         y_m: centre of the body across the road, if it is not a lane's centre.
         desired_speed_mps: above 0; 0.001 for a vehicle that stays stopped.
         target_lane: the lane it keeps or is moving to; None: the lane it is in.
-        visibility: when others see its lane changes; None: the scene's ``ego_visibility`` or
-            ``others_visibility``.
+        visibility: when others see its lane changes, a :class:`Visibility`; None: the scene's
+            ``ego_visibility`` or ``others_visibility``.
         origin: place in its file, for messages ("line 3").
     """
 
@@ -90,8 +91,8 @@ class SceneVehicle:
     length_m: float = 4.5
     width_m: float = 2.5
     target_lane: int | None = None
-    visibility: Visibility | None = None
-    origin: str = field(default="", compare=False)
+    visibility: int | None = None
+    origin: str = field(default="", compare=False, metadata=NO_KEY)
 
     def y_on(self, road: Road) -> float:
         """Centre of the body across the road, m."""

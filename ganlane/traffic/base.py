@@ -41,6 +41,18 @@ def new_tensordict(fields: Mapping[str, Any], n: int) -> TensorDict:
     return TensorDict._new_unsafe(dict(fields), batch_size=torch.Size([n]))
 
 
+def zero_memory(fields: MemoryFields, x: Tensor) -> dict[str, Any]:
+    """Zeros for the ``fields`` of rows of vehicles at ``x`` [N, M]; nested as they are."""
+    memory: dict[str, Any] = {}
+    for name, field in fields.items():
+        if isinstance(field, Mapping):
+            memory[name] = new_tensordict(zero_memory(field, x), len(x))
+        else:
+            shape, dtype = field
+            memory[name] = x.new_zeros((*x.shape, *shape), dtype=dtype)
+    return memory
+
+
 def memory_of(tensordict: TensorDictBase, key: str = keys.TRAFFIC) -> TensorDictBase:
     """The memory under ``key``; empty if it is missing, since TorchRL drops empty TensorDicts."""
     memory = tensordict.get(key, None)
@@ -154,11 +166,7 @@ class TrafficModule(TensorDictModuleBase):
 
         ``key`` [N] is for random parameters.
         """
-        (n, m), x = vehicles.x.shape, vehicles.x
-        return {
-            name: x.new_zeros((n, m, *shape), dtype=dtype)
-            for name, (shape, dtype) in self.memory_fields.items()
-        }
+        return zero_memory(self.memory_fields, vehicles.x)
 
     def road_of(self, key: Tensor, dtype: torch.dtype) -> Road:
         """The road of the episodes with ``key`` [N]."""
@@ -203,10 +211,6 @@ class TrafficModule(TensorDictModuleBase):
         return self.move(Vehicles.of(state.get(keys.VEHICLES)), memory, key, step)
 
     @outside_autocast
-    def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
-        """:meth:`fresh_memory` as a TensorDict [N]."""
-        return new_tensordict(self.fresh_memory(vehicles, key), len(vehicles.x))
-
     def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """The start of episodes: the initial scene and the memory.
 
@@ -217,22 +221,7 @@ class TrafficModule(TensorDictModuleBase):
             key, episode: the episodes' keys and numbers, [N] int64.
         """
         # What is drawn at the start has a key of its own, apart from the draws of the steps.
-        return vehicles, self.init_memory(vehicles, absorb(key, 0))
-
-    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
-        """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""
-        return _spec(self.memory_fields, n, m, dtype)
-
-
-def _spec(fields: MemoryFields, n: int, m: int, dtype: torch.dtype) -> dict[str, Any]:
-    spec: dict[str, Any] = {}
-    for name, field in fields.items():
-        if isinstance(field, Mapping):
-            spec[name] = _spec(field, n, m, dtype)
-        else:
-            shape, kind = field
-            spec[name] = ((n, m, *shape), kind or dtype)
-    return spec
+        return vehicles, new_tensordict(self.fresh_memory(vehicles, absorb(key, 0)), len(key))
 
 
 class Overlay(TrafficModule):
@@ -316,11 +305,6 @@ class TrafficSequential(TrafficParts):
             new_memories[name] = tensordict.get(keys.TRAFFIC)
         n = tensordict.batch_size[0]
         return tensordict.set(keys.TRAFFIC, new_tensordict(new_memories, n))
-
-    def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
-        """The parts' memories, by name."""
-        memories = {name: part.init_memory(vehicles, key) for name, part in self.named_parts()}
-        return new_tensordict(memories, len(key))
 
     def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """The vehicles after the parts' :meth:`TrafficModule.enter`, and the memories by name."""

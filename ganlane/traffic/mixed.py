@@ -6,10 +6,10 @@ Which one an episode gets follows from its number or key, so it is the same in e
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import cast
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
@@ -26,6 +26,7 @@ from ganlane.traffic.base import (
     memory_of,
     new_tensordict,
     with_rows,
+    zero_memory,
 )
 
 #: A part, its name before it, and its rows [R] of the batch.
@@ -134,9 +135,9 @@ class MixedTraffic(TrafficParts):
 
     def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """Every row by its part; the memory of the other parts is zero there."""
-        (n, m), x = vehicles.x.shape, vehicles.x
+        n = len(key)
         together = new_tensordict(vehicles.as_dict(), n)
-        memories = _zeros(self.memory_spec(n, m, x.dtype), n, x.device)
+        memories = new_tensordict(zero_memory(self.memory_fields, vehicles.x), n)
         for name, part, rows in self.rows_of_parts(episode):
             # A traffic sees only its own rows of the scene.
             scene = vehicles.part(rows)
@@ -149,24 +150,6 @@ class MixedTraffic(TrafficParts):
             together = with_rows(together, rows, entered.as_dict())
             memories.set(name, with_rows(memories.get(name), rows, memory))
         return Vehicles.of(together), memories
-
-    def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
-        """Not available: the part follows from the episode's number (:meth:`enter`)."""
-        raise UserError(
-            "traffic=mixed: its memory begins with an episode's number; call enter() in place of "
-            "this."
-        )
-
-
-def _zeros(spec: Mapping[str, Any], n: int, device: torch.device) -> TensorDict:
-    """A memory of zeros by :meth:`TrafficModule.memory_spec`."""
-    fields: dict[str, Any] = {}
-    for name, entry in spec.items():
-        if isinstance(entry, Mapping):
-            fields[name] = _zeros(entry, n, device)
-        else:
-            fields[name] = torch.zeros(entry[0], dtype=entry[1], device=device)
-    return new_tensordict(fields, n)
 
 
 class BlindTraffic(TrafficModule):
@@ -224,7 +207,3 @@ class BlindTraffic(TrafficModule):
     def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """As the model."""
         return self.model.enter(vehicles, key, episode)
-
-    def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
-        """As the model's."""
-        return self.model.init_memory(vehicles, key)

@@ -19,8 +19,6 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec
-from torchrl.data.tensor_specs import Binary
 
 from ganlane import keys
 from ganlane.errors import UserError
@@ -141,13 +139,3 @@ class ActionMaskTransform(PerceptionTransform):
         for name, flags in zip(self.out_keys, (mask, none[:, None])):
             state.set(name, flags)
         return state
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the mask to the spec."""
-        assert isinstance(observation_spec, Composite)
-        for name, size in zip(self.out_keys, (len(self.actions.names), 1)):
-            shape = (*observation_spec.shape, size)
-            observation_spec[name] = Binary(
-                shape=shape, dtype=torch.bool, device=observation_spec.device
-            )
-        return observation_spec

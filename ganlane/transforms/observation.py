@@ -18,7 +18,6 @@ from typing import Final, NamedTuple
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
 
 from ganlane import keys
 from ganlane.errors import UserError
@@ -336,12 +335,3 @@ class ObservationTransform(PerceptionTransform):
             further = control_numbers(vehicles, set_speed, road)
             observation = torch.cat((observation, further), dim=1)
         return state.set(keys.OBSERVATION, observation)
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add ``observation`` to the spec."""
-        assert isinstance(observation_spec, Composite)
-        shape = (*observation_spec.shape, observation_size(self.form, self.vehicles, self.actions))
-        true = observation_spec[keys.VEHICLES, "x"]
-        spec = Unbounded(shape=shape, dtype=true.dtype, device=true.device)
-        observation_spec[keys.OBSERVATION] = spec
-        return observation_spec

@@ -7,12 +7,11 @@ from functools import reduce
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform
 
 from ganlane import keys
 from ganlane.keys import EGO_INDEX
 from ganlane.settings.observation import RewardParameters
+from ganlane.transforms.base import StateTransform
 
 
 def speed_reward(
@@ -31,7 +30,7 @@ def speed_reward(
     return torch.where(mean_acceleration < p.low_acceleration, punished, reward)
 
 
-class RewardTransform(Transform):
+class RewardTransform(StateTransform):
     """Write ``reward`` [N, 1] and ``reward_terms.*`` [N, 1], on the speed at a decision's end.
 
     Args:
@@ -79,16 +78,6 @@ class RewardTransform(Transform):
         # A reset has driven nothing, yet its keys must be those of a step.
         zero = torch.zeros_like(tensordict_reset.get(keys.VEHICLES).get("x")[:, :1])
         return _write_terms(tensordict_reset, dict.fromkeys(self.parameters.term_names, zero))
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the terms to the observation spec; they are zero after a reset."""
-        assert isinstance(observation_spec, Composite)
-        shape = observation_spec.shape
-        true = observation_spec[keys.VEHICLES, "x"]
-        term = Unbounded(shape=(*shape, 1), dtype=true.dtype, device=true.device)
-        terms = dict.fromkeys(self.parameters.term_names, term)
-        observation_spec[keys.REWARD_TERMS] = Composite(terms, shape=shape).to(true.device)
-        return observation_spec
 
 
 def _write_terms(state: TensorDictBase, terms: dict[str, Tensor]) -> TensorDictBase:

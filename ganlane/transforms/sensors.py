@@ -22,14 +22,13 @@ from typing import Final
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform
 
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.settings.observation import SensorParameters
 from ganlane.sim.random import Purpose, Stream, episode_key, normal, uniform
 from ganlane.sim.state import Vehicles
+from ganlane.transforms.base import StateTransform
 
 PERCEIVED: Final = "perceived"
 SENSORS: Final = "sensors"
@@ -64,7 +63,7 @@ def measure(
     return TensorDict._new_unsafe(values, batch_size=valid.shape[:1], device=valid.device)
 
 
-class PerceptionTransform(Transform):
+class PerceptionTransform(StateTransform):
     """Base of the transforms of what the ego perceives; subclasses implement :meth:`write`."""
 
     def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
@@ -92,7 +91,7 @@ class PerceptionTransform(Transform):
         return self.forward(tensordict_reset)
 
 
-class SensorTransform(Transform):
+class SensorTransform(StateTransform):
     """Write ``perceived``, and with a delay ``sensors``; belongs before the observation.
 
     The errors follow from (stream, seed, episode, vehicle, physics step, purpose), so an episode is
@@ -158,18 +157,3 @@ class SensorTransform(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the ego would perceive if the raw state were an episode's first."""
         return self._reset(tensordict, tensordict)
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add ``perceived``, and with a delay ``sensors``, to the spec."""
-        assert isinstance(observation_spec, Composite)
-        # Shapes and device as of the true positions.
-        true = observation_spec[keys.VEHICLES, "x"]
-        rows, count = true.shape
-        shapes: dict[str, tuple[int, ...]] = {PERCEIVED: (rows, count)}
-        if self.delay > 0:
-            shapes[SENSORS] = (rows, self.delay, count)
-        for name, shape in shapes.items():
-            fields = dict.fromkeys(("x", "y", "speed"), Unbounded(shape=shape, dtype=true.dtype))
-            fields["valid"] = Binary(shape=shape, dtype=torch.bool)
-            observation_spec[name] = Composite(fields, shape=shape[:1]).to(true.device)
-        return observation_spec

@@ -116,7 +116,7 @@ def course(
     and the traffic's memory.
     """
     key = episode_keys(range(len(cars.x)))
-    memory = traffic.init_memory(cars, key)
+    _, memory = traffic.enter(cars, key, torch.arange(len(key)))
     for step in range(steps):
         state = TensorDict(
             {

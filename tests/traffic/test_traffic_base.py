@@ -18,6 +18,7 @@ from ganlane.traffic import (
     ReplayTraffic,
     TrafficSequential,
 )
+from ganlane.traffic.base import zero_memory
 from ganlane.traffic.presets import gan_calibrated_traffic
 
 SHARES = {"idm": 1, "idm_faults": 1}
@@ -38,7 +39,7 @@ MODELS = {
 
 
 def shapes(memory):
-    """As :meth:`TrafficModule.memory_spec`."""
+    """Nested name -> (shape, dtype)."""
     return {
         name: shapes(value) if isinstance(value, TensorDict) else (tuple(value.shape), value.dtype)
         for name, value in memory.items()
@@ -51,7 +52,8 @@ def test_memory_and_moved_are_as_declared_and_the_state_at_t_is_never_written(na
     state = environment(num_envs=4, traffic=traffic, dtype=torch.float32).reset()
     for step in range(2):
         before = state.clone()
-        assert shapes(state.get(keys.TRAFFIC, TensorDict({}))) == traffic.memory_spec(4, 9)
+        declared = zero_memory(traffic.memory_fields, state[keys.VEHICLES, "x"])
+        assert shapes(state.get(keys.TRAFFIC, TensorDict({}))) == shapes(declared)
         after = traffic(state.clone(recurse=False))
         assert same_bits(state, before) == []
         moved = after[keys.MOVED]

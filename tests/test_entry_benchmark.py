@@ -15,7 +15,7 @@ import ganlane
 from ganlane.agents.checkpoint import agent_file
 from ganlane.config.run import run_command, settings
 from ganlane.evaluation.rows import FAILURES
-from ganlane.suite import cells
+from ganlane.suite import driving
 
 main = partial(run_command, "benchmark")
 SHORT = ["suite.env.goal_m=60", "hydra.run.dir=out", "suite.scored={idm: 2}"]
@@ -27,13 +27,14 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 @pytest.fixture
 def cells_driven(monkeypatch):
     """The cells that were driven, by driver and traffic."""
-    driven, drive_cell = [], cells._drive
+    driven, drive_cell = [], driving._drive
 
-    def noting(cell):
-        driven.append((cell.driver.name, cell.traffic))
-        return drive_cell(cell)
+    def noting(driver, config, file):
+        (traffic,) = config.traffics
+        driven.append((driver.name, traffic))
+        return drive_cell(driver, config, file)
 
-    monkeypatch.setattr(cells, "_drive", noting)
+    monkeypatch.setattr(driving, "_drive", noting)
     return driven
 
 

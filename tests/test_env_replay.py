@@ -12,11 +12,14 @@ import torch
 from reference.refusals import user_error
 from reference.synthetic import varied_scenes
 from reference.worlds import run, step
+from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from ganlane import keys
 from ganlane.agents.drivers import KeepLaneDriver, MobilDriver, RandomLegalDriver
 from ganlane.env import HighwayEnv
+from ganlane.evaluation.episodes import _episode_rows
+from ganlane.evaluation.measures import first_marks
 from ganlane.settings.road import FAR_M, WALL
 from ganlane.sim.random import episode_key
 from ganlane.sim.state import Vehicles
@@ -119,6 +122,20 @@ def test_lanes_end_where_the_roads_say_seen_from_the_start_of_each_episode(recor
     assert torch.equal(step(env, td)[keys.ROAD, "wall_m"], road["wall_m"])
 
 
+def at_fault_in(state: TensorDict, env: HighwayEnv) -> list[bool | None]:
+    """What is told of episodes that end in this state, by row."""
+    rows = env.batch_size[0]
+    none = torch.zeros(rows)
+    counted = ("reward", *keys.EVENT_COUNTS, "squared_acceleration")
+    parts = {
+        "last": state,
+        "marks": first_marks(none),
+        "sums": TensorDict(dict.fromkeys(counted, none), [rows]),
+    }
+    driven = TensorDict(parts, [rows])
+    return _episode_rows(driven, list(range(rows)), 0, env.road)["at_fault"].to_list()
+
+
 def test_the_ego_brakes_for_the_wall_of_its_own_row_and_runs_into_it(recordings, tmp_path):
     """From 10 m/s it needs 2.5 m at 20 m/s2; where nobody else has ever been."""
     wall = {"end_m": 5000, "end": "wall"}
@@ -133,6 +150,7 @@ def test_the_ego_brakes_for_the_wall_of_its_own_row_and_runs_into_it(recordings,
         td[keys.VEHICLES, name][:, 0] = value
     after = step(env, td)
     assert torch.equal(after[keys.EVENTS, "hard_crash"][:, 0], ends)
+    assert at_fault_in(after, env) == [True if near else None for near in ends.tolist()]
     speed = after[keys.VEHICLES, "speed"][:, 0]
     assert speed[ends].max() < 10.0 < speed[~ends].min()
 

@@ -11,7 +11,7 @@ import ganlane
 from ganlane import keys
 from ganlane.agents.drivers import MobilDriver
 from ganlane.env import HighwayEnv
-from ganlane.evaluation.episodes import ego_at_fault
+from ganlane.evaluation.measures import ego_at_fault
 from ganlane.settings.driving import MobilParameters
 from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
 from ganlane.sim.dynamics import ego_scene

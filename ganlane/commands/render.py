@@ -7,7 +7,7 @@ from pathlib import Path
 from ganlane.build import make_driver
 from ganlane.settings.render import FILMS, RenderConfig
 from ganlane.sim.random import Stream
-from ganlane.suite.episodes import drive_episode
+from ganlane.suite.driving import drive_episode
 from ganlane.view import write_film, write_player, write_tracks
 from ganlane.view.curves import draw_runs, read_runs
 from ganlane.view.figures import save_figure

@@ -22,7 +22,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.evaluation.measures import LEAST, crash_kinds, ego_at_fault, first_marks, marks_after
+from ganlane.evaluation.measures import CRASHES, LEAST, crash_kinds, first_marks, marks_after
 from ganlane.sim.state import STRAIGHT, Road, Vehicles, road_in
 
 #: Decisions between two looks at which rows have ended. A look waits for the device and a reset
@@ -71,9 +71,9 @@ def run_episodes(
         ``soft_crash`` and ``soft_crash_behind`` (onsets), ``had_soft_crash``, ``reward``
         (undiscounted return), ``reward_*`` (each term's sum), ``decisions``, ``duration_s``,
         ``distance_m``, ``mean_speed_mps`` (distance over time), ``lane_changes``; of a hard crash,
-        else null, ``at_fault`` (:func:`ganlane.evaluation.measures.ego_at_fault`) and ``crash``
-        (:data:`ganlane.evaluation.measures.CRASHES`); ``least_ttc_s``, ``least_headway_s``,
-        ``hardest_braking_mps2`` and ``rms_acceleration_mps2`` (at the ends of decisions).
+        else null, ``crash`` (:data:`ganlane.evaluation.measures.CRASHES`) and ``at_fault``, whether
+        it is the first of them; ``least_ttc_s``, ``least_headway_s``, ``hardest_braking_mps2`` and
+        ``rms_acceleration_mps2`` (at the ends of decisions).
 
     Raises:
         UserError: no episodes are asked for, the environment is not batched in one dimension, or
@@ -267,15 +267,14 @@ def _episode_rows(
     columns |= {name: ego[name] for name in ("distance", "lane_changes", "decisions")}
     columns["duration_s"] = last[keys.STEP].double() * keys.PHYSICS_STEP_S
     marks = driven["marks"]
-    columns |= {name: mark for name, mark in marks.items() if name != "change_s"}
+    columns |= dict(marks.items())
     # A state without vehicles tells nothing about a crash.
-    at_fault: list[bool | None] = [None] * len(numbers)
-    crash: list[str | None] = [None] * len(numbers)
+    kinds: list[str | None] = [None] * len(numbers)
     if keys.VEHICLES in last:
         vehicles = Vehicles.of(last[keys.VEHICLES])
         since_s = columns["duration_s"] - marks["change_s"]
-        at_fault[:] = ego_at_fault(vehicles, road).tolist()
-        crash[:] = crash_kinds(vehicles, since_s, road_in(last, road))
+        kinds[:] = crash_kinds(vehicles, since_s, road_in(last, road))
+    crash = pl.when("hard_crash").then(pl.Series("crash", kinds, pl.String))
     # The reward's terms are the environment's own, so their names are not known here.
     terms = [name for name in columns if name.startswith("reward_")]
     ends = [pl.when(pl.col(event)).then(pl.lit(event)) for event in keys.END_EVENTS]
@@ -298,8 +297,8 @@ def _episode_rows(
         # Null for an episode that ended before it drove (off the road at once).
         pl.when(duration > 0).then(distance / duration).alias("mean_speed_mps"),
         pl.col("lane_changes").cast(pl.Int64),
-        pl.when("hard_crash").then(pl.Series("at_fault", at_fault, pl.Boolean)),
-        pl.when("hard_crash").then(pl.Series("crash", crash, pl.String)),
+        (crash == CRASHES[0]).alias("at_fault"),
+        crash,
         *LEAST,
         rms_acceleration_mps2=(pl.col("squared_acceleration") / pl.col("decisions")).sqrt(),
     )

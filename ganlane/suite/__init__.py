@@ -5,10 +5,9 @@ goes on where it was, and one with other drivers drives those alone.
 
 Modules:
 
-- :mod:`~ganlane.suite.driving`: drivers on traffics (also ``ganlane evaluate``).
-- :mod:`~ganlane.suite.cells`: the same, cell by cell, each stored in a file.
+- :mod:`~ganlane.suite.driving`: drivers on traffics (also ``ganlane evaluate``), for a suite cell
+  by cell, each stored in a file; an episode for a film.
 - :mod:`~ganlane.suite.scores`: numbers with the training as the unit.
 - :mod:`~ganlane.suite.report`: the table, and the page with films.
 - :mod:`~ganlane.suite.run`: all of it, from drivers to results.
-- :mod:`~ganlane.suite.episodes`: records an episode for a film.
 """

@@ -1,19 +1,42 @@
-"""Drivers on traffics, each on the same episodes."""
+"""Drivers on traffics, each on the same episodes.
+
+For a suite every pair of driver and traffic is a cell, whose episodes are stored in a file. A cell
+that is there is not driven again, so a command that was stopped goes on where it was.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import sys
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import polars as pl
 from tqdm import tqdm
 
-from ganlane import evaluation
+from ganlane.agents.drivers import Driver as RuleDriver
+from ganlane.agents.drivers import GreedyPolicy
+from ganlane.agents.stored_models import StoredModel
 from ganlane.build import Driver, make_env, make_traffic
+from ganlane.errors import UserError
+from ganlane.evaluation import code_version, run_episodes
+from ganlane.files import opened
 from ganlane.settings.commands import EvaluateConfig
+from ganlane.settings.record import plain
+from ganlane.settings.render import RenderConfig
+from ganlane.settings.suite import BenchmarkConfig
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.random import Stream
 from ganlane.traffic import ReplayTraffic
+from ganlane.view.record import Trajectory, record_episode
+
+#: Name in the metadata of a cell's file.
+_ORIGIN = "ganlane"
 
 
 def compare(
@@ -23,9 +46,9 @@ def compare(
 
     Each of ``drivers`` (:func:`ganlane.build.make_driver`) drives with its own observation and
     mask, or with those of ``config`` if it names none; the sensors are those of ``config`` for all.
-    ``quiet`` shows no progress. ``once``: where a traffic replays, no start of the recordings is
-    driven twice (:meth:`ganlane.traffic.ReplayTraffic.episodes_once`), so that there may be fewer
-    episodes.
+    The progress is a bar, without a terminal a line per driver and traffic; ``quiet`` shows none.
+    ``once``: where a traffic replays, no start of the recordings is driven twice
+    (:meth:`ganlane.traffic.ReplayTraffic.episodes_once`), so that there may be fewer episodes.
 
     Returns:
         What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one
@@ -42,19 +65,23 @@ def compare(
     total = len(modules) * len(drivers) * episodes
     # One table per driver and traffic, concatenated at the end.
     tables = []
-    disabled = quiet or not sys.stderr.isatty()
-    with tqdm(total=total, unit="episode", file=sys.stderr, disable=disabled) as bar:
+    no_terminal = not sys.stderr.isatty()
+    with tqdm(total=total, unit="episode", disable=quiet or no_terminal) as bar:
         for traffic, module in modules.items():
             numbers: Sequence[int] = range(episodes)
             if once and isinstance(module, ReplayTraffic):
                 numbers = module.episodes_once(seed, env.idm)[:episodes]
             for driver in drivers:
+                title = f"{driver.name} on {traffic}"
+                bar.set_description(title)
                 of_driver, policy = driver.driving(config)
                 # All but the number of rows, which shrinks towards the end.
                 make = partial(make_env, module, of_driver)
                 batch = make(min(config.num_envs, len(numbers)))
-                report = None if quiet else _reporter(bar, f"{driver.name} on {traffic}")
-                table = evaluation.run_episodes(batch, policy, numbers, seed, report, make)
+                report = partial(_advance, bar, bar.n)
+                table = run_episodes(batch, policy, numbers, seed, report, make)
+                if no_terminal and not quiet:
+                    print(f"{title}: {table.height} episodes", file=sys.stderr)
                 table = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
                 # Episodes of one recorded scene are no independent observations.
                 if isinstance(module, ReplayTraffic):
@@ -67,18 +94,122 @@ def compare(
     return pl.concat(tables, how="diagonal")
 
 
-def _reporter(bar: tqdm, title: str) -> Callable[[int, int], None]:
-    """Callback that shows the progress of one driver and traffic.
+def _advance(bar: tqdm, before: int, finished: int, wanted: int) -> None:
+    """Move the bar, which counts the episodes of all drivers: ``before`` were of others."""
+    bar.update(before + finished - bar.n)
 
-    On the bar, or as one line without a terminal.
+
+def drive_episode(
+    driver: Driver,
+    traffic: TrafficConfig,
+    config: EvaluateConfig | RenderConfig,
+    episode: int,
+    end_s: float | None = None,
+) -> Trajectory:
+    """Record an episode of the seed and stream of ``config``, up to ``end_s``, for a film or page.
+
+    Raises:
+        UserError: see :func:`ganlane.build.make_traffic`.
     """
-    bar.set_description(title)
-    # The bar counts the episodes of all drivers, the callback those of one.
-    before = bar.n
+    # A trained agent brings the mask and the observation that it was trained with.
+    driven, policy = driver.driving(config)
+    env = make_env(make_traffic(traffic, config.env, Stream.named(config.stream)), driven)
+    return record_episode(env, policy, config.seed, episode, driver.name, traffic.label(), end_s)
 
-    def report(finished: int, wanted: int) -> None:
-        bar.update(before + finished - bar.n)
-        if bar.disable and finished == wanted:
-            print(f"{title}: {wanted} episodes", file=sys.stderr, flush=True)
 
-    return report
+# --- the cells of a suite
+
+
+def available(config: BenchmarkConfig) -> tuple[list[str], dict[str, str]]:
+    """The traffics that can be driven on here, and the others with the reason why not."""
+    traffics = config.suite.traffics()
+    missing = {}
+    for name, option in traffics.items():
+        try:
+            # Made and thrown away: only now a missing package or recording shows.
+            make_traffic(option, config.suite.env)
+        except UserError as error:
+            # The score needs all of its traffics.
+            if name in config.suite.scored:
+                raise
+            missing[name] = str(error)
+    return [name for name in traffics if name not in missing], missing
+
+
+def drive_suite(
+    drivers: Sequence[Driver], traffics: Sequence[str], config: BenchmarkConfig
+) -> tuple[pl.DataFrame, dict[str, float]]:
+    """The episodes of all cells, one below the other, and seconds by driver.
+
+    Cells that are stored are read, the others are driven, traffic by traffic.
+
+    Raises:
+        UserError: a stored file without the episodes of a cell; the message names it.
+    """
+    cells = [(driver, alone) for alone in map(config.on, traffics) for driver in drivers]
+    tables = []
+    seconds: dict[str, float] = {}
+    no_terminal = not sys.stderr.isatty()
+    for driver, alone in tqdm(cells, unit="cell", disable=no_terminal):
+        file = _file_of(driver, alone, Path(config.cells))
+        if file is not None and file.is_file():
+            table, took_s = _read(file)
+        else:
+            table, took_s = _drive(driver, alone, file)
+            if no_terminal:
+                title = f"{driver.name} on {', '.join(alone.traffics)}"
+                print(f"{title}: {table.height} episodes", file=sys.stderr)
+        tables.append(table)
+        seconds[driver.name] = seconds.get(driver.name, 0.0) + took_s
+    return pl.concat(tables, how="diagonal"), seconds
+
+
+def _file_of(driver: Driver, config: EvaluateConfig, folder: Path) -> Path | None:
+    """The file of a cell, named by everything that its episodes depend on but the code.
+
+    None for a user's own code, of which nobody knows when it changes: its episodes are not stored.
+    """
+    if not isinstance(driver.policy, GreedyPolicy | RuleDriver | StoredModel):
+        return None
+    # The weights themselves, not a file's name: a training under the same name is another driver.
+    weights = hashlib.sha256()
+    for name, value in driver.policy.state_dict().items():
+        # Noise for exploring is drawn anew by every process.
+        if not name.endswith("_epsilon"):
+            weights.update(value.cpu().numpy().tobytes())
+    driven, _ = driver.driving(config)
+    settings: dict[str, Any] = asdict(driven)
+    # They change how fast the cell is driven, not what happens.
+    for name in ("threads", "columns", "num_envs", "agents"):
+        del settings[name]
+    settings |= {
+        "driver": driver.name,
+        "weights": weights.hexdigest(),
+        "traffics": {name: plain(item) for name, item in config.traffics.items()},
+    }
+    text = json.dumps(settings, sort_keys=True, default=str)
+    return folder / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.parquet"
+
+
+def _drive(driver: Driver, config: EvaluateConfig, file: Path | None) -> tuple[pl.DataFrame, float]:
+    """Drive one cell and store it; its episodes, and the seconds that it took."""
+    begun = time.monotonic()
+    table = compare([driver], config, quiet=True, once=True)
+    took_s = time.monotonic() - begun
+    if file is not None:
+        # The file tells where it comes from, whoever finds it.
+        origin = json.dumps({"code": code_version(), "seconds": took_s})
+        with opened(file) as content:
+            table.write_parquet(content, metadata={_ORIGIN: origin})
+    return table, took_s
+
+
+def _read(path: Path) -> tuple[pl.DataFrame, float]:
+    """A stored cell."""
+    try:
+        origin = json.loads(pl.read_parquet_metadata(path)[_ORIGIN])
+        return pl.read_parquet(path), float(origin["seconds"])
+    except (OSError, KeyError, ValueError, TypeError, pl.exceptions.PolarsError) as error:
+        raise UserError(
+            f"{path}: not the episodes of a cell ({error}); remove it and start again."
+        ) from error

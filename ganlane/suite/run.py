@@ -16,8 +16,7 @@ from ganlane.evaluation.table import show
 from ganlane.settings.suite import BenchmarkConfig
 from ganlane.sim.random import Stream
 from ganlane.suite import report, scores
-from ganlane.suite.cells import available, cells_of, drive
-from ganlane.suite.episodes import drive_episode
+from ganlane.suite.driving import available, drive_episode, drive_suite
 from ganlane.view import Trajectory
 from ganlane.view.player import player_page
 
@@ -67,8 +66,7 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
         print(f"left out, {name}: {reason}", file=sys.stderr)
     names = {driver.name for driver in agents}
     others = drivers_of([name for name in suite.drivers() if name not in names], config)
-    cells = cells_of([*others, *agents], traffics, config)
-    episodes, seconds = drive(cells)
+    episodes, seconds = drive_suite([*others, *agents], traffics, config)
     by_recipe = scores.by_recipe(episodes)
     matrix = scores.rows(by_recipe)
     entries = scores.summaries(by_recipe, matrix, suite)

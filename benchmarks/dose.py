@@ -4,8 +4,8 @@
     python -m benchmarks.dose table
     python -m benchmarks.dose figure
 
-The first takes hours on one core and goes on where it ended. For two cores: `train --part 0/2`
-beside `train --part 1/2`.
+The first takes hours on one core and goes on where it ended. For two cores: `train --part 0 2`
+beside `train --part 1 2`.
 
 Every training is the same: MaskablePPO as in `examples/sb3_ppo.py`, from random weights, among
 `human` drivers with one property changed, or among other drivers altogether. Its agent then drives
@@ -269,14 +269,6 @@ def measure(arguments: argparse.Namespace) -> str:
     return train(folder, list(trainings(arguments.seeds, arguments.properties))[part::parts])
 
 
-def part_of_many(text: str) -> tuple[int, int]:
-    """``0/2`` is the first of two parts."""
-    part, parts = (int(number) for number in text.split("/"))
-    if not 0 <= part < parts:
-        raise ValueError
-    return part, parts
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """The script."""
     parser = make_parser(__doc__)
@@ -288,10 +280,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     add_report(parser, SECTIONS[0])
     parser.add_argument(
-        "--part",
-        type=part_of_many,
-        default=(0, 1),
-        help="which part of how many, counted from 0: 0/2",
+        "--part", nargs=2, type=int, default=(0, 1), help="which of how many, from 0: 0 2"
     )
     return run_script(measure, parser.parse_args(arguments))
 

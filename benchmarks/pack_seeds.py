@@ -137,8 +137,7 @@ def pack(options: argparse.Namespace) -> str:
         for seed, (_, network, metadata) in agents.items()
     }
     save_weights(options.out, SEVERAL, tensors, {"agents": described})
-    written_mb = options.out.stat().st_size / 1e6
-    return f"{options.out}: seeds {', '.join(map(str, agents))}; {written_mb:.1f} MB"
+    return f"{options.out}: seeds {', '.join(map(str, agents))}; {size / 1e6:.1f} MB"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

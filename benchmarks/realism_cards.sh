@@ -13,4 +13,4 @@ rivals='against=[gan,idm_mobil,idm,idm_faults]'
 for figure in distributions distances; do
     cp "outputs/cards/all/$figure.png" "docs/figures/realism_$figure.png"
 done
-"$python" -m benchmarks.figures --folder docs/figures
+"$python" -m benchmarks.figures

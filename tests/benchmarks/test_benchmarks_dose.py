@@ -92,9 +92,3 @@ def test_the_figure_has_a_panel_for_every_property(tmp_path):
 def test_without_trainings_it_says_what_to_run(tmp_path):
     with user_error("run 'train' first"):
         dose.dose_table(tmp_path)
-
-
-def test_a_part_that_is_none_is_refused(capsys):
-    with pytest.raises(SystemExit):
-        dose.main(["train", "--part", "2/2"])
-    assert "--part" in capsys.readouterr().err

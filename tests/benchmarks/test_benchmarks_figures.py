@@ -5,8 +5,9 @@ Shapes and weights are those of the loaded networks, courses those of the vehicl
 
 import pytest
 
-from benchmarks.figures import generator_blocks
+from benchmarks.figures import generator_blocks, transfer
 from ganlane.generator import load_generator, shipped_generator
+from ganlane.view.figures import save_figure
 
 
 @pytest.mark.parametrize("preset", ["paper", "calibrated"])
@@ -23,3 +24,7 @@ def test_the_architecture_shows_every_weight_and_the_shapes_of_the_loaded_genera
     assert blocks["embedding"].shape == (5, sizes.observed - 1, 4 * sizes.hidden)
     assert blocks["context"].shape == (5, sizes.hidden - sizes.noise)
     assert blocks["predicted displacements"].shape == (5, sizes.predicted, 2)
+
+
+def test_the_transfer_is_drawn_from_the_committed_curves(tmp_path):
+    assert save_figure(transfer(), tmp_path / "figure.png").stat().st_size > 10_000

@@ -6,7 +6,7 @@
 
     agent = ganlane.load_agent("agent_idm")
     env = ganlane.make_env("gan", 64, observation=agent.observation, mask=agent.mask, lanes=4)
-    rollout = env.rollout(100, agent.policy)
+    rollout = env.rollout(100, agent.policy, break_when_any_done=False)
     calmer = {"name": "gan", "noise_scale": 0.5}
     table = ganlane.api.evaluate([agent, "mobil"], {"gan": "gan", "calmer": calmer}, episodes=100)
 

@@ -41,7 +41,7 @@ from ganlane.config.run import (
 )
 from ganlane.errors import UserError, did_you_mean
 from ganlane.evaluation import evaluation_rows
-from ganlane.evaluation.results import Run, TrainingRun, plain
+from ganlane.evaluation.results import Run, TrainingRun, as_json
 from ganlane.runtime import worker_number
 from ganlane.settings.commands import EvaluateConfig, highways
 from ganlane.settings.record import Record
@@ -173,7 +173,7 @@ def evaluate(
     if per_episode:
         return table
     # Plain Python numbers: polars takes no others.
-    return pl.DataFrame(plain(evaluation_rows(table)), infer_schema_length=None)
+    return pl.DataFrame(as_json(evaluation_rows(table)), infer_schema_length=None)
 
 
 def benchmark(

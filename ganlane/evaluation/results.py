@@ -85,7 +85,7 @@ def write_results(
         "machine": machine(),
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
-    write_json(path, plain(content))
+    write_json(path, as_json(content))
     return path
 
 
@@ -178,21 +178,21 @@ def write_episodes(folder: str | Path, episodes: pl.DataFrame) -> Path:
     return path
 
 
-def plain(value: Any) -> Any:
+def as_json(value: Any) -> Any:
     """``value`` as JSON can hold it: plain numbers, strings, lists and dictionaries.
 
     NaN and infinity as None.
     """
     # Records first: they hold everything below.
     if is_dataclass(value) and not isinstance(value, type):
-        return plain(asdict(value))
+        return as_json(asdict(value))
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): as_json(item) for key, item in value.items()}
     # A tensor or an array becomes nested lists, a scalar of theirs a plain number.
     if isinstance(value, (np.ndarray, np.generic, torch.Tensor)):
-        return plain(value.tolist())
+        return as_json(value.tolist())
     if isinstance(value, (list, tuple, set, range)):
-        return [plain(item) for item in value]
+        return [as_json(item) for item in value]
     # JSON has neither NaN nor infinity.
     if isinstance(value, float):
         return value if math.isfinite(value) else None

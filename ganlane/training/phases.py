@@ -25,7 +25,7 @@ from ganlane.agents.network import load_parameters
 from ganlane.build import make_env, make_traffic, reading_of
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
-from ganlane.evaluation.results import flat, plain
+from ganlane.evaluation.results import as_json, flat
 from ganlane.settings.observation import ObservationConfig
 from ganlane.settings.train import TrainConfig
 from ganlane.sim.random import Stream
@@ -89,7 +89,7 @@ def length_if_finished(phase: Phase) -> dict[str, float] | None:
             f"pretrain.total_decisions={wanted}: this phase is over, after {done} decisions; "
             "resume with the value that the run was started with."
         )
-    if flat(training["traffic"]) != flat(plain(phase.config.traffic)):
+    if flat(training["traffic"]) != flat(as_json(phase.config.traffic)):
         raise UserError(
             "traffic@pretrain.traffic: this phase is over, on other traffic; resume with the same."
         )
@@ -247,8 +247,8 @@ def save_final_agent(
 def identity(config: TrainConfig) -> dict[str, Any]:
     """The settings that a resumed run must share with the run that was stopped."""
     return {
-        "env": plain(config.env),
-        "traffic": plain(config.traffic),
+        "env": as_json(config.env),
+        "traffic": as_json(config.traffic),
         "observation": asdict(config.observation),
         "reward": asdict(config.reward),
         "mask": asdict(config.mask),
@@ -267,15 +267,15 @@ def describe(phase: Phase) -> dict[str, Any]:
         "mask": asdict(config.mask),
         "sensors": asdict(config.observation)["sensors"],
         "environment": {"vehicles": config.env.vehicles, "lanes": config.env.lanes},
-        "env": plain(config.env),
+        "env": as_json(config.env),
         "num_envs": config.num_envs,
         "code": code_version(),
-        "agent": plain(config.agent),
+        "agent": as_json(config.agent),
         "reward": asdict(config.reward),
         "training": {
             "phase": phase.name,
             "init": phase.start,
             "seed": config.seed,
-            "traffic": plain(config.traffic),
+            "traffic": as_json(config.traffic),
         },
     }

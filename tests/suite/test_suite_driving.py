@@ -7,7 +7,7 @@ import pytest
 import ganlane
 from ganlane.commands.evaluate import publish
 from ganlane.evaluation import crashes_by_scene, evaluation_rows, failed_episodes, paired_rows
-from ganlane.evaluation.results import plain
+from ganlane.evaluation.results import as_json
 from ganlane.settings.commands import EvaluateConfig
 from ganlane.sim.random import Stream
 from ganlane.traffic import ReplayTraffic
@@ -32,8 +32,8 @@ def test_every_replayed_episode_has_the_scene_that_it_ran_in(table, three_scenes
 def test_the_record_holds_rows_paired_leads_failures_and_crashes_by_scene(table, tmp_path, capsys):
     publish(table, tmp_path, EvaluateConfig(columns="all"), {})
     record = json.loads((tmp_path / "results.json").read_text())
-    assert record["rows"] == plain(evaluation_rows(table))
-    assert record["paired"] == plain(paired_rows(table))
+    assert record["rows"] == as_json(evaluation_rows(table))
+    assert record["paired"] == as_json(paired_rows(table))
     assert record["failures"] == failed_episodes(table)
     assert capsys.readouterr().out.count("keep_lane over random_legal") == 2
     assert [row["agent"] for row in record["crashes_by_scene"]] == ["keep_lane", "random_legal"]

@@ -139,3 +139,8 @@ def test_a_long_training_is_compiled_where_that_is_known_to_work(version, compil
 def test_shares_on_the_command_line_replace_those_of_an_experiment():
     words = ["experiment=general", "traffic.shares={idm: 1, gan_calibrated: 2}"]
     assert config_of("train", *words).traffic.shares == {"idm": 1, "gan_calibrated": 2}
+
+
+def test_an_option_on_the_command_line_replaces_that_of_an_experiment():
+    assert config_of("train", "experiment=general").init.path == "agent_gan"
+    assert config_of("train", "experiment=general", "init=none").init.path is None

@@ -181,8 +181,7 @@ def close_the_loop(
     for number in range(config.rounds):
         # Long stretches begin as recorded, short ones as nine noisy positions show drivers.
         long = _gathered(material, options, config, random, times=2)
-        short = samples_of(material.short, noisy, random)
-        latest = joined([long, short]).moves
+        latest = joined([long, samples_of(material.short, noisy, random)]).moves
         bank = [*bank[-1:], latest]
 
         order = torch.randperm(len(teacher.change), generator=random)
@@ -363,7 +362,6 @@ def prior_drivers(road: Road, scenes: int, random: torch.Generator) -> PriorDriv
     desired = torch.where(rand() < 0.5, 14.0 + 20.0 * rand(), speed + 8.0 * rand())
     headway = torch.exp(math.log(1.25) + 0.42 * randn()).clamp(0.5, 3.0)
     aside = torch.where(astray, 0.45, 0.15) * randn()
-    target = torch.where(astray, road.lane_of(y).long(), lane)
 
     zero = torch.zeros(shape)
     vehicles = cars(
@@ -375,7 +373,7 @@ def prior_drivers(road: Road, scenes: int, random: torch.Generator) -> PriorDriv
         length=zero + 4.5,
         width=zero + 1.9,
         desired_speed=desired.clamp(*DESIRED_MPS),
-        target_lane=target,
+        target_lane=torch.where(astray, road.lane_of(y).long(), lane),
     )
     return PriorDrivers(vehicles, lane, speed, aside, headway)
 
@@ -402,11 +400,10 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
     # A memory that fits to this, up to noise: the style shows the headway, as it does in traffic.
     history = before[..., None] + 0.4 * randn(*speed.shape, ACCELERATIONS)
     history[..., 0] = before
-    style = torch.stack((torch.log(headway) + 0.2 * randn(), 0.5 * rand(), 0.5 * randn()), -1)
     memory = Memory(
         accelerations=history,
+        style=torch.stack((torch.log(headway) + 0.2 * randn(), 0.5 * rand(), 0.5 * randn()), -1),
         lateral_speeds=aside[..., None] + 0.03 * randn(*speed.shape, 2),
-        style=style,
         age=12.0 * rand(),
         since=12.0 * rand(),
         closing=view.closing[..., None] + 0.3 * randn(*speed.shape, 2),
@@ -415,9 +412,8 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
 
     # Recordings are silent at high speed, at a standstill, on a free road and before a collision.
     time_to_collision = view.gap / (-view.closing).clamp_min(1e-3)
-    time_gap = view.gap / speed.clamp_min(1.0)
     silent = (speed > 19.0) | (speed < 1.5) | (view.gap > 80.0)
-    silent |= (time_to_collision < 4.0) | (time_gap < 0.5)
+    silent |= (time_to_collision < 4.0) | (view.gap / speed.clamp_min(1.0) < 0.5)
     # Few overlap.
     silent &= ~((view.gap < 0.0) & (rand() < 0.8))
     far_off = (vehicles.y - road.centre_of(vehicles.target_lane)).abs() > 0.75
@@ -430,7 +426,12 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
     back = (-0.45 * (vehicles.y - road.centre_of(lane))).clamp(-0.9, 0.9)
     sideways = 0.4 * (back - aside) + 0.03 * randn()
 
-    lateral_weight = torch.where(far_off, 0.5, 0.1)
-    moves = Moves(features_of(situation), change, sideways, silent.float(), lateral_weight)
+    moves = Moves(
+        features_of(situation),
+        change,
+        sideways,
+        silent.float(),
+        torch.where(far_off, 0.5, 0.1),
+    )
     sides = lane_choice(situation).sides
     return moves.rows(silent | far_off), sides[~leaves_room(sides) & view.exists]

@@ -100,8 +100,7 @@ def present_of(estimator: Estimator, segments: Segments) -> Situation:
         target_lane=torch.where(leaving, next_lane, lane).long(),
         valid=segments.present[:, PRESENT],
     )
-    age = torch.where(whole, trust(nine), 0.0)
-    memory = present_memory(motion, age)
+    memory = present_memory(motion, torch.where(whole, trust(nine), 0.0))
     return situation_of(vehicles, memory, road, first=torch.ones_like(whole))
 
 

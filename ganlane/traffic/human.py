@@ -173,12 +173,11 @@ class HumanTraffic(TrafficModule):
         driver = DriverMemory(*(memory[name] for name in DriverMemory._fields))
         situation = situation_of(vehicles, driver, self.road)
 
-        # A choice [N, M] between going on, left and right; the side's numbers as a polite driver
-        # takes them to be.
+        # A choice [N, M] between going on, left and right; by the sides as a polite driver takes
+        # them to be, while ``sides`` are what they are.
         option = lane_choice(situation)
-        sides, polite = option.sides, option.sides.clone()
-        polite[..., REAR_BRAKING] *= variation.politeness
-        option = option._replace(sides=polite)
+        sides = option.sides.clone()
+        option.sides[..., REAR_BRAKING] *= variation.politeness
         if self.road.stretches:
             ways = ways_out(vehicles, self.road, self.mobil.mandatory_m)
             option = option._replace(exists=torch.stack((ways.left, ways.right), -1))

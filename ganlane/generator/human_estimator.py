@@ -1,6 +1,7 @@
 """A driver's present motion from its last nine positions, whatever noise is on them.
 
-A small network, fitted to pairs of recorded and smoothed tracks.
+The :class:`Estimator` is a small network, fitted to pairs of recorded and smoothed tracks. The
+:class:`Observer` is another one: what a recording will show besides the driver's motion.
 """
 
 from __future__ import annotations
@@ -42,10 +43,10 @@ OBSERVED_SCALE, FORECAST_SCALE, DIFFERENCE_SCALE = (0.1, 0.03), (0.3, 0.1), (0.1
 
 
 class Estimator(nn.Module):
-    """A driver's motion from nine positions.
+    """A driver's motion from nine positions, 0.1 s apart.
 
-    Speed; acceleration over the last and the last but one 0.4 s; lateral speed now and 0.4 s ago;
-    and the errors of the last position along and across.
+    Seven numbers: speed, m/s; acceleration over the last and the last but one 0.4 s, m/s2; lateral
+    speed now and 0.4 s ago, m/s; and by how much the last position is wrong along and across, m.
     """
 
     def __init__(self) -> None:
@@ -53,10 +54,13 @@ class Estimator(nn.Module):
         self.layers = layers(20, HIDDEN, HIDDEN, len(SCALES))
 
     def forward(self, positions: Tensor) -> Tensor:
-        """[..., 7] from positions [..., 9, 2] in m."""
+        """The motion [..., 7] from positions [..., 9, 2] in m, wherever their origin is."""
+        # Velocities [..., 8, 2] between the positions, m/s, and how they differ from their mean.
         motion = positions.diff(dim=-2) / PHYSICS_STEP_S
         mean = motion.mean(-2, keepdim=True)
         apart = motion - mean
+
+        # 8 + 8 + 2 + 1 + 1 numbers of about the size of 1.
         inputs = [
             apart[..., 0],
             3.0 * apart[..., 1],
@@ -66,6 +70,7 @@ class Estimator(nn.Module):
         ]
         out = self.layers(torch.cat(inputs, -1))
         scale = torch.tensor([1.0, 1.0, 1.0, 0.3, 0.3, 0.1, 0.1])
+
         # The network corrects the mean speeds along and across.
         level = torch.zeros_like(out)
         level[..., 0] = mean[..., 0, 0]
@@ -89,9 +94,12 @@ class Observer(nn.Module):
         """Differences [..., 8, 2] in m; positions [..., 9, 2] and forecast [..., 8, 2] are relative
         to the last position.
         """
+        # Displacements in 0.1 s and their mean, m.
         motion = positions.diff(dim=-2)
         mean = motion.mean(-2, keepdim=True)
         steps = torch.arange(1, PREDICTED_STEPS + 1, device=mean.device)[:, None]
+
+        # What both have beyond a constant velocity.
         apart = (motion - mean) / motion.new_tensor(OBSERVED_SCALE)
         ahead = (forecast - steps * mean) / motion.new_tensor(FORECAST_SCALE)
         out = self.layers(torch.cat((apart.flatten(-2), ahead.flatten(-2)), -1))
@@ -110,7 +118,10 @@ class HumanModel(nn.Module):
 
 
 def roughness(positions: Tensor) -> Tensor:
-    """How much speeds jitter from step to step, m/s, along and across, [..., 2]."""
+    """How much speeds jitter from step to step, m/s, along and across, [..., 2].
+
+    The root mean square of the velocity's second difference, which a driver's motion has hardly.
+    """
     motion = positions.diff(dim=-2) / PHYSICS_STEP_S
     return motion.diff(dim=-2).diff(dim=-2).square().mean(-2).sqrt()
 
@@ -121,31 +132,45 @@ def trust(positions: Tensor) -> Tensor:
 
 
 def present_memory(motion: Tensor, age: Tensor) -> Memory:
-    """What drivers remember whose ``motion`` [N, M, 7] is the :class:`Estimator`'s."""
-    # Older accelerations are not known.
+    """What drivers remember whose ``motion`` [N, M, 7] is the :class:`Estimator`'s.
+
+    ``age`` [N, M]: for how many decisions they count as seen (:func:`trust`).
+    """
+    # Older accelerations than two decisions' are not known: 0.
     accelerations = pad(motion[..., 1:3], (0, ACCELERATIONS - 2))
-    return memory_of(accelerations, motion[..., 4:5].repeat(1, 1, LATERAL_SPEEDS), age)
+    lateral_speeds = motion[..., 4:5].repeat(1, 1, LATERAL_SPEEDS)
+    return memory_of(accelerations, lateral_speeds, age)
 
 
 def fit_estimator(
     estimator: Estimator, scenes: Sequence[SmoothScene], random: torch.Generator
 ) -> None:
-    """Fit the estimator to these scenes, which hold the recorded and the smoothed positions."""
+    """Fit the estimator to these scenes, which hold the recorded and the smoothed positions.
+
+    What it is to find is the motion of the smoothed track, under none, some or all of the recorded
+    noise. It needs no gradients afterwards.
+    """
     raw, smooth, motion = _tracks(scenes)
     optimizer = torch.optim.Adam(estimator.parameters(), RATE)
     for update in range(UPDATES):
         optimizer.param_groups[0]["lr"] = RATE * half_cosine(update, UPDATES)
+
+        # Positions [B, 9, 2] with a share of the recorded noise.
         rows = torch.randint(len(raw), (BATCH,), generator=random)
         noise = noise_shares(BATCH, 0.25, 0.65, random)
         positions = smooth[rows] + noise * (raw[rows] - smooth[rows])
+
         # The last two numbers are the error of the last position.
         wanted = motion[rows].clone()
         wanted[:, 5:] -= positions[:, -1]
+
+        # Mirrored at random: positions across, both lateral speeds, the error across.
         side = random_sides(BATCH, random)
         positions = positions - positions[:, -1:]
         positions[..., 1] *= side
         wanted[:, [3, 4, 6]] *= side
-        descend(optimizer, error_in(estimator(positions.float()) - wanted.float(), SCALES))
+        difference = estimator(positions.float()) - wanted.float()
+        descend(optimizer, error_in(difference, SCALES))
     estimator.requires_grad_(False)
 
 
@@ -156,7 +181,8 @@ def noise_shares(rows: int, without: float, as_recorded: float, random: torch.Ge
     """
     share = 1.2 * torch.rand((rows, 1, 1), generator=random)
     draw = torch.rand((rows, 1, 1), generator=random)
-    return torch.where(draw < without, 0.0, torch.where(draw < as_recorded, 1.0, share))
+    noisy = torch.where(draw < as_recorded, 1.0, share)
+    return torch.where(draw < without, 0.0, noisy)
 
 
 def random_sides(rows: int, random: torch.Generator) -> Tensor:
@@ -171,18 +197,25 @@ def error_in(difference: Tensor, scales: tuple[float, ...]) -> Tensor:
 
 
 def _tracks(scenes: Sequence[SmoothScene]) -> tuple[Tensor, Tensor, Tensor]:
-    """Nine recorded and smoothed positions [R, 9, 2], and the motion at the last one [R, 7]."""
+    """Nine recorded and smoothed positions [R, 9, 2], and the motion at the last one [R, 7].
+
+    In float64, since places on the road are large numbers. The motion ends with the smoothed place
+    itself; what an :class:`Estimator` is to find is how far an observed one is from it.
+    """
     raw, smooth, motion = [], [], []
     for scene in scenes:
         for track in range(scene.x.shape[1]):
             rows = np.flatnonzero(scene.present[:, track])
+            # Every 0.2 s.
             for last in range(rows[0] + OBSERVED_POSITIONS - 1, rows[-1] + 1, 2):
-                at = slice(last - OBSERVED_POSITIONS + 1, last + 1), track
-                raw.append(np.stack((scene.raw_x[at], scene.raw_y[at]), -1))
-                smooth.append(np.stack((scene.x[at], scene.y[at]), -1))
+                nine = slice(last - OBSERVED_POSITIONS + 1, last + 1), track
+                raw.append(np.stack((scene.raw_x[nine], scene.raw_y[nine]), -1))
+                smooth.append(np.stack((scene.x[nine], scene.y[nine]), -1))
+
+                # At the last position, and one and two decisions before it, newest first.
                 speed = scene.speed[[last, last - STEPS, last - 2 * STEPS], track]
                 aside = scene.lateral_speed[[last, last - STEPS], track]
-                changes = -np.diff(speed) / DECISION_S
+                accelerations = -np.diff(speed) / DECISION_S
                 place = (scene.x[last, track], scene.y[last, track])
-                motion.append([speed[0], *changes, *aside, *place])
+                motion.append([speed[0], *accelerations, *aside, *place])
     return tuple(torch.tensor(np.array(numbers)) for numbers in (raw, smooth, motion))  # type: ignore[return-value]

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from ganlane.data.dense import Recording
@@ -51,7 +51,7 @@ from ganlane.generator.human_tuning import Report, begins_per_decision, tune
 from ganlane.settings.generator import HumanConfig
 from ganlane.sim.idm import IdmParameters, following_acceleration, with_headways
 from ganlane.sim.neighbours import perceive as scene_of
-from ganlane.sim.state import Road
+from ganlane.sim.state import Road, Vehicles
 
 #: Decisions of a segment: of whole scenes, and short ones, which begin more often as recorded.
 LONG_DECISIONS, SHORT_DECISIONS = 20, 5
@@ -90,7 +90,10 @@ class Material(NamedTuple):
 
 
 def material_of(scenes: Sequence[SmoothScene], random: torch.Generator) -> Material:
-    """Everything that a policy is fitted to."""
+    """Everything that a policy is fitted to, cut from smoothed ``scenes``.
+
+    Stretches overlap: they begin every few frames of 0.1 s, more often where scenes are few.
+    """
     wide = [scene for scene in scenes if scene.two_dimensional]
     narrow = [scene for scene in scenes if not scene.two_dimensional]
     prior, danger = prior_samples(random)
@@ -111,30 +114,48 @@ def fit_human(
 ) -> HumanModel:
     """Fit a model to ``recordings`` of several lanes and to cars ``following`` each other in one.
 
-    It is in evaluation mode. Each of the :func:`fit_steps` is reported.
+    Args:
+        config: sizes, seed, learning rate and the number of epochs, rounds and iterations.
+        recordings: positions along and across the road, 10 Hz, m.
+        following: positions along the road alone; they weigh :data:`ONE_LANE_WEIGHT`.
+        report: called after each of the :func:`fit_steps`.
+
+    Returns:
+        The model in evaluation mode, without gradients. Its observer is not fitted yet
+        (:func:`ganlane.generator.human_forecasts.fit_observer`).
     """
     # Networks draw their first weights from torch's own generator, which stays the caller's.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         random = torch.Generator().manual_seed(config.seed)
         model = HumanModel(config.sizes)
+
+        # The estimator learns from recorded noise, and to leave exact positions as they are.
         scenes = [smooth_scene(recording, config) for recording in recordings]
         exact = [without_noise(recording, config) for recording in recordings]
         fit_estimator(model.estimator, [*scenes, *exact], random)
+
         scenes += [smooth_scene(one, config, ONE_LANE_WEIGHT) for one in following]
         material = material_of(scenes, random)
+
         # Lane changes are few: none of them is hidden, as the sides are from some of the moves.
         choices = _gathered(material, Options(blind=0.0), config, random, times=2).choices
         teacher = _gathered(material, Options(), config, random, times=3).moves
+
+        # Cloning: the first half of the epochs at the full rate, the second at half of it.
         policy, danger = model.policy, material.danger
         for rate in (config.learning_rate, 0.5 * config.learning_rate):
             train_moves(policy, teacher, material.prior, max(1, config.epochs // 2), rate, random)
         train_lane_choice(policy, choices, danger, random)
         match_rate(policy, choices)
         report(None)
+
         close_the_loop(model, material, teacher, config, random, report)
+
+        # Accidents cost; the pull keeps the rest as it is.
         tune(policy, choices, danger, config.tuning, config.pull, random, report)
         match_rate(policy, choices)
+
         # More lane changes bring new accidents: it learns to do without them at this level.
         pull = SETTLING_TIMES * config.pull
         tune(policy, None, danger, config.settling, pull, random, report)
@@ -149,7 +170,11 @@ def close_the_loop(
     random: torch.Generator,
     report: Report,
 ) -> None:
-    """Rounds of closed-loop samples: the last two rounds and as many teacher samples count."""
+    """Fit the policy of ``model`` to where its own moves lead, in ``config.rounds`` rounds.
+
+    A round is fitted to its own closed-loop samples, to those of the round before, and to as many
+    samples of the ``teacher``, in which everybody drives as recorded.
+    """
     bank: list[Moves] = []
     options = Options(model.policy, samples=config.samples)
     noisy = options._replace(estimator=model.estimator)
@@ -158,8 +183,11 @@ def close_the_loop(
         long = _gathered(material, options, config, random, times=2)
         latest = joined([long, samples_of(material.short, noisy, random)]).moves
         bank = [*bank[-1:], latest]
-        rows = torch.randperm(len(teacher.change), generator=random)[: len(latest.change)]
-        moves = Moves(*map(torch.cat, zip(teacher.rows(rows), *bank)))
+
+        order = torch.randperm(len(teacher.change), generator=random)
+        as_recorded = teacher.rows(order[: len(latest.change)])
+        moves = Moves(*map(torch.cat, zip(as_recorded, *bank)))
+
         # From half of the cloning's rate down to a sixth of it.
         rate = 0.5 * config.learning_rate * (1.0 - 0.7 * number / max(1, config.rounds - 1))
         epochs = max(1, config.epochs // 3)
@@ -170,7 +198,11 @@ def close_the_loop(
 def _gathered(
     material: Material, options: Options, config: HumanConfig, random: torch.Generator, times: int
 ) -> Samples:
-    """Samples of all stretches, ``times`` over; in the last pass they are lengthened."""
+    """Samples of all stretches: of scenes ``times`` over, of single lanes once.
+
+    Passes differ by what is drawn: sides swapped or hidden, lanes widened, moves of the policy. In
+    the last pass the way is lengthened by up to ``config.scale``: the same traffic, but faster.
+    """
     scales = [0.0] * (times - 1) + [config.scale]
     parts = [samples_of(material.around, options._replace(scale=scale), random) for scale in scales]
     if material.ahead:
@@ -188,25 +220,38 @@ def train_moves(
     rate: float,
     random: torch.Generator,
 ) -> None:
-    """Fit the distributions to ``moves``, with the prior's beside them, by the cross-entropies of
-    the wanted changes along and across.
+    """Fit the distributions to ``moves``, with the prior's beside them.
+
+    The loss is the cross-entropy of the tokens around the wanted changes along and across
+    (:meth:`ganlane.generator.human.Tokens.soft_target`), weighted per sample.
+
+    Args:
+        moves: batches hold :data:`BATCH` of these samples.
+        prior: a batch holds :data:`PRIOR_SHARE` as many of these besides, drawn at random.
+        epochs: passes over ``moves``.
+        rate: the highest learning rate.
     """
-    parts = (policy.trunk, policy.along, policy.across)
-    parameters = [parameter for part in parts for parameter in part.parameters()]
-    optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=1e-3, fused=True)
+    fitted = nn.ModuleList([policy.trunk, policy.along, policy.across])
+    optimizer = torch.optim.AdamW(fitted.parameters(), lr=rate, weight_decay=1e-3, fused=True)
     rows = len(moves.change)
     updates = max(1, epochs * (rows // BATCH))
     update = 0
     for _ in range(epochs):
         for batch in torch.randperm(rows, generator=random).split(BATCH):
+            # The batch [B], and beside it [P] of the prior's samples.
             beside = int(PRIOR_SHARE * len(batch))
-            also = torch.randint(len(prior.change), (beside,), generator=random)
-            both = Moves(*map(torch.cat, zip(moves.rows(batch), prior.rows(also))))
+            of_prior = torch.randint(len(prior.change), (beside,), generator=random)
+            both = Moves(*map(torch.cat, zip(moves.rows(batch), prior.rows(of_prior))))
+
+            # Logits [B + P, tokens] of what is seen with a little noise.
             noise = INPUT_NOISE * torch.randn(both.features.shape, generator=random)
             along, across = policy(both.features + noise)
-            losses = -(ALONG.soft_target(both.change) * along.log_softmax(-1)).sum(-1)
-            lateral = -(ACROSS.soft_target(both.aside) * across.log_softmax(-1)).sum(-1)
-            loss = (losses * both.weight + lateral * both.lateral_weight).mean()
+            wanted_along = ALONG.soft_target(both.change)
+            wanted_across = ACROSS.soft_target(both.aside)
+            loss_along = -(wanted_along * along.log_softmax(-1)).sum(-1)
+            loss_across = -(wanted_across * across.log_softmax(-1)).sum(-1)
+            loss = (loss_along * both.weight + loss_across * both.lateral_weight).mean()
+
             # A short warm-up, then a half cosine to 0.
             rise = min(1.0, (update + 1) / 100)
             optimizer.param_groups[0]["lr"] = rate * (rise * half_cosine(update, updates))
@@ -221,27 +266,37 @@ def train_lane_choice(
 
     Beginning is a logistic regression on the recorded ones; nobody begins one into danger. Changes
     under way go on as recorded ones did, and are broken off in danger.
+
+    Args:
+        policy: its network ``lane`` has two logits per side: to begin a change, to break it off.
+        choices: recorded ones; without a recorded change the policy stays as it is.
+        danger: sides that nobody changes to, [D, SIDE_FEATURES].
     """
     begun = choices.sides[choices.begins == 1]
     not_begun = choices.sides[choices.begins == 0]
     under_way = choices.sides[choices.begins < 0]
     if not len(begun):
-        return  # without a recorded change nobody changes lanes
+        return
+
+    # Begin from the recorded rate, with little influence of what is seen.
     weight, bias = policy.lane[-1].parameters()
     with torch.no_grad():
-        # From the recorded rate on.
         bias.copy_(torch.tensor([math.log(len(begun) / len(not_begun)), -2.0]))
         weight.mul_(0.1)
     optimizer = torch.optim.AdamW(policy.lane.parameters(), lr=LANE_RATE, weight_decay=LANE_DECAY)
     for _ in range(LANE_UPDATES):
+        # All of the few recorded changes, and some of the many decisions against one.
         rows = torch.randint(len(not_begun), (4096,), generator=random)
         others = torch.randint(len(danger), (1024,), generator=random)
         begins = policy.lane(begun)[:, 0]
         stays = policy.lane(not_begun[rows])[:, 0]
         in_danger = policy.lane(danger[others])
+
+        # The negative log-likelihood, per recorded change, so that few count as much as many.
         scale = len(not_begun) / len(rows)
-        # Per recorded change, so that few count as much as many.
         loss = (softplus(-begins).sum() + scale * softplus(stays).sum()) / len(begun)
+
+        # Into danger: begun with a logit below -10, broken off with a positive one.
         loss = loss + 2.0 * softplus(in_danger[:, 0] + 10.0).mean()
         loss = loss + softplus(-in_danger[:, 1]).mean()
         if len(under_way):
@@ -260,8 +315,9 @@ def match_rate(policy: HumanPolicy, choices: Choices) -> None:
     _, bias = policy.lane[-1].parameters()
     choice = choices.keeping(slice(None))
     unmoved = bias[0].clone()
-    low, high = -6.0, 6.0
+
     # Bisection: the rate grows with the bias.
+    low, high = -6.0, 6.0
     for _ in range(20):
         middle = 0.5 * (low + high)
         bias[0] = unmoved + middle
@@ -269,65 +325,113 @@ def match_rate(policy: HumanPolicy, choices: Choices) -> None:
         low, high = (middle, high) if begins < wanted else (low, middle)
 
 
-@torch.no_grad()
-def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[Moves, Tensor]:
-    """IDM drivers with headways of their own where recordings show nothing, and lane changes into
-    danger [D, SIDE_FEATURES].
+class PriorDrivers(NamedTuple):
+    """IDM drivers in random scenes, [N, M] each; ``vehicles`` do not accelerate yet.
+
+    Attributes:
+        lane: whose centre a driver swings back to, int64; it may head for another one.
+        speed, aside: along and across the road as drawn, m/s.
+        headway: that the driver keeps, s.
+    """
+
+    vehicles: Vehicles
+    lane: Tensor
+    speed: Tensor
+    aside: Tensor
+    headway: Tensor
+
+
+def prior_drivers(road: Road, scenes: int, random: torch.Generator) -> PriorDrivers:
+    """Drivers at random places on a ``road`` of three lanes, :data:`PRIOR_VEHICLES` in a scene.
+
+    Speeds are 0 to 38 m/s, headways around 1.25 s (log-normal, 0.5 to 3 s). The drivers of a scene
+    are about equally fast, at a density of its own: 60 to 560 m for all of them.
     """
     shape = (scenes, PRIOR_VEHICLES)
     rand, randn = draws(shape, random)
-    road = Road(3, 3.6)
     lane = torch.randint(0, 3, shape, generator=random)
     # A third of the drivers is somewhere between two lanes.
     astray = rand() < 0.35
-    y = lane * 3.6 + torch.where(astray, 3.2, 0.5) * (rand() - 0.5)
+    y = lane * road.lane_width_m + torch.where(astray, 3.2, 0.5) * (rand() - 0.5)
+
+    # The pace [N, 1] of a scene, what drivers differ from it, and a few who stand or crawl.
     pace = 36.0 * rand(scenes, 1) ** 0.8
     speed = (pace + 6.0 * randn() * rand(scenes, 1)).clamp(0.0, 38.0)
     speed = torch.where(rand() < 0.08, 3.0 * rand(), speed)
+    # Half of the drivers would like to go as fast as they do, or up to 8 m/s faster.
     desired = torch.where(rand() < 0.5, 14.0 + 20.0 * rand(), speed + 8.0 * rand())
     headway = torch.exp(math.log(1.25) + 0.42 * randn()).clamp(0.5, 3.0)
     aside = torch.where(astray, 0.45, 0.15) * randn()
-    target = torch.where(astray, road.lane_of(y).long(), lane)
-    whole = torch.full(shape, 1.0)
+
+    zero = torch.zeros(shape)
     vehicles = cars(
         rand() * (60.0 + 500.0 * rand(scenes, 1)),
         y,
         speed,
         aside,
-        acceleration=0.0 * whole,
-        length=4.5 * whole,
-        width=1.9 * whole,
+        acceleration=zero,
+        length=zero + 4.5,
+        width=zero + 1.9,
         desired_speed=desired.clamp(*DESIRED_MPS),
-        target_lane=target,
+        target_lane=torch.where(astray, road.lane_of(y).long(), lane),
     )
+    return PriorDrivers(vehicles, lane, speed, aside, headway)
+
+
+@torch.no_grad()
+def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[Moves, Tensor]:
+    """What recordings do not show: moves of IDM drivers, and lane changes into danger.
+
+    Returns:
+        Moves of the drivers [R] whose situation is rare or missing in recordings, and sides
+        [D, SIDE_FEATURES] where a lane change leaves no room.
+    """
+    road = Road(3, 3.6)
+    vehicles, lane, speed, aside, headway = prior_drivers(road, scenes, random)
+    rand, randn = draws(speed.shape, random)
+
+    # What IDM asks for now, m/s2; drivers did that in part so far, or something else.
     idm = IdmParameters(comfortable_deceleration=2.0, min_acceleration=-8.0, max_acceleration=1.4)
     wanted = following_acceleration(scene_of(vehicles, road), with_headways(idm, headway))
     before = torch.where(rand() < 0.5, 0.6 * randn(), (wanted * rand()).clamp(-6.0, 2.0))
-    history = before[..., None] + 0.4 * randn(*shape, ACCELERATIONS)
-    history[..., 0] = before
-    style = torch.stack((torch.log(headway) + 0.2 * randn(), 0.5 * rand(), 0.5 * randn()), -1)
-    lateral = aside[..., None] + 0.03 * randn(*shape, 2)
-    none = torch.zeros(*shape, 2)
-    memory = Memory(history, lateral, none, style, 12.0 * rand(), 12.0 * rand())
     vehicles = vehicles.with_(acceleration=before)
     view = perceive(vehicles, road)
-    memory = memory._replace(closing=view.closing[..., None] + 0.3 * randn(*shape, 2))
+
+    # A memory that fits to this, up to noise: the style shows the headway, as it does in traffic.
+    history = before[..., None] + 0.4 * randn(*speed.shape, ACCELERATIONS)
+    history[..., 0] = before
+    memory = Memory(
+        accelerations=history,
+        style=torch.stack((torch.log(headway) + 0.2 * randn(), 0.5 * rand(), 0.5 * randn()), -1),
+        lateral_speeds=aside[..., None] + 0.03 * randn(*speed.shape, 2),
+        age=12.0 * rand(),
+        since=12.0 * rand(),
+        closing=view.closing[..., None] + 0.3 * randn(*speed.shape, 2),
+    )
     situation = Situation(vehicles, memory, road, view)
 
+    # Recordings are silent at high speed, at a standstill, on a free road and before a collision.
     time_to_collision = view.gap / (-view.closing).clamp_min(1e-3)
     silent = (speed > 19.0) | (speed < 1.5) | (view.gap > 80.0)
     silent |= (time_to_collision < 4.0) | (view.gap / speed.clamp_min(1.0) < 0.5)
     # Few overlap.
     silent &= ~((view.gap < 0.0) & (rand() < 0.8))
-    far_off = (y - road.centre_of(target)).abs() > 0.75
+    far_off = (vehicles.y - road.centre_of(vehicles.target_lane)).abs() > 0.75
 
-    # Half of the way to IDM's acceleration, all of it where that is hard braking.
+    # Along: half of the way to IDM's acceleration, all of it where that is hard braking.
     hard = wanted < -2.0
     change = torch.where(hard, 1.0, 0.5) * (wanted - before)
     change = change + torch.where(hard, 0.05, 0.18) * randn()
-    back = (-0.45 * (y - road.centre_of(lane))).clamp(-0.9, 0.9)
+    # Across: back to the lane's centre within some two seconds.
+    back = (-0.45 * (vehicles.y - road.centre_of(lane))).clamp(-0.9, 0.9)
     sideways = 0.4 * (back - aside) + 0.03 * randn()
-    lateral_weight = torch.where(far_off, 0.5, 0.1)
-    moves = Moves(features_of(situation), change, sideways, silent.float(), lateral_weight)
+
+    moves = Moves(
+        features_of(situation),
+        change,
+        sideways,
+        silent.float(),
+        torch.where(far_off, 0.5, 0.1),
+    )
     sides = lane_choice(situation).sides
     return moves.rows(silent | far_off), sides[~leaves_room(sides) & view.exists]

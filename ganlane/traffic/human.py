@@ -93,6 +93,8 @@ class HumanTraffic(TrafficModule):
         count, dtype = vehicles.x.shape[1], vehicles.x.dtype
         drawn = normal(key, -1, count, [Purpose.TRAIT_HEADWAY], dtype)[..., 0]
         memory = entering_memory(vehicles, self.road, drawn)
+
+        # Until the first decision, which is due at once, everybody goes straight on.
         _, lateral = velocity(vehicles)
         nothing = torch.zeros_like(vehicles.x)
         return {
@@ -107,9 +109,13 @@ class HumanTraffic(TrafficModule):
         """Drive 0.1 s, after a decision where one is due."""
         phase = step % STEPS
         vehicles, memory = self._where_due(vehicles, memory, key, step, phase == 0)
+
         # Evenly from the lateral speed at the decision to the one that was chosen.
         share = (phase[:, None] + 1).to(vehicles.x.dtype) / STEPS
         across = memory["lateral_from"] + share * (memory["lateral_to"] - memory["lateral_from"])
+
+        # The acceleration holds until the driver stands. A body turns no further than its speed
+        # allows, so the new lateral speed is read again.
         speed, lateral = velocity(vehicles)
         later = (speed + memory["acceleration"] * self.dt).clamp_min(0.0)
         moved = with_velocity(vehicles, later, across)
@@ -123,7 +129,11 @@ class HumanTraffic(TrafficModule):
     def _where_due(
         self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor, due: Tensor
     ) -> Moved:
-        """Decisions in the rows where one is ``due`` [N]."""
+        """Decisions in the rows where one is ``due`` [N]: rows begin at steps of their own.
+
+        On a CPU the other rows are left out of the policy; elsewhere all rows decide, since to
+        count those that are due would wait for the device or break a compiled graph.
+        """
         if not reads_are_cheap(vehicles.x):
             decided, new_memory = self.decide(vehicles, memory, key, step)
             new_memory = {
@@ -135,6 +145,8 @@ class HumanTraffic(TrafficModule):
             return self.decide(vehicles, memory, key, step)
         if not len(rows):
             return vehicles, memory
+
+        # The rows that are due decide by themselves, and go back to their places.
         part = vehicles.part(rows)
         its_memory = {name: value[rows] for name, value in memory.items()}
         decided, new_memory = self.decide(part, its_memory, key[rows], step[rows])
@@ -145,28 +157,38 @@ class HumanTraffic(TrafficModule):
         return vehicles.with_(target_lane=target), merged
 
     def decide(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
-        """Target lanes, and the memory with what every driver does for 0.4 s."""
+        """Target lanes, and the memory with what every driver does for 0.4 s.
+
+        Perceive, choose a lane, draw a move, bound it: the policy knows roads whose lanes go on for
+        ever, and where lanes end rules come on top of it.
+        """
         policy, variation = in_dtype(self.policy, vehicles.x.dtype), self.drivers.variation
+        u = uniforms(vehicles, key, step, *_DRAWS)
         if self.road.stretches:
+            # m/s2 [N, M], for a neighbour who has to leave its lane; from before the choices.
             scene = scene_of(vehicles, self.road)
             makes_room = yielding(scene, self.drivers.idm, self.mobil)
+
         vehicles = vehicles.with_(target_lane=self.road.clamp_lane(vehicles.target_lane))
         driver = DriverMemory(*(memory[name] for name in DriverMemory._fields))
         situation = situation_of(vehicles, driver, self.road)
-        u = uniforms(vehicles, key, step, *_DRAWS)
+
+        # A choice [N, M] between going on, left and right; by the sides as a polite driver takes
+        # them to be, while ``sides`` are what they are.
         option = lane_choice(situation)
-        sides, polite = option.sides, option.sides.clone()
-        polite[..., REAR_BRAKING] *= variation.politeness
-        option = option._replace(sides=polite)
+        sides = option.sides.clone()
+        option.sides[..., REAR_BRAKING] *= variation.politeness
         if self.road.stretches:
             ways = ways_out(vehicles, self.road, self.mobil.mandatory_m)
             option = option._replace(exists=torch.stack((ways.left, ways.right), -1))
-        choice = chosen(policy.lane_chances(option, variation.lane_changes), u[2])
+        chances = policy.lane_chances(option, variation.lane_changes)
+        choice = chosen(chances, u[2])
         if self.road.stretches:
             choice = _leaving(choice, option.keeping, ways, sides, u[3])
         situation = with_choice(situation, choice)
         vehicles = situation.vehicles
-        # Its moves follow the driver's choice.
+
+        # Its moves follow the driver's choice: changes in m/s2 along, in m/s across.
         along, across = policy(features_of(situation))
         change = ALONG.sample(along, u[0], variation.temperature)
         aside = ACROSS.sample(across, u[1], variation.temperature)
@@ -174,6 +196,7 @@ class HumanTraffic(TrafficModule):
         if self.road.stretches:
             acceleration = torch.minimum(acceleration, self._before_walls(vehicles, scene))
             acceleration = torch.minimum(acceleration, makes_room)
+
         driver = remembered(situation, acceleration)
         return vehicles, {
             **driver._asdict(),
@@ -191,13 +214,17 @@ class HumanTraffic(TrafficModule):
         half a metre: unlike drivers by rules these do not keep to the centres of their lanes, and
         they would brake for the end of another lane, or for one that lies behind them.
         """
+        # The front end as a straight, narrower body, as far aside as the heading puts it.
         aside = 0.5 * vehicles.length * torch.sin(vehicles.heading)
         front = vehicles.with_(
             y=vehicles.y + aside,
             heading=torch.zeros_like(aside),
             width=vehicles.width - 2.0 * BESIDE_WALL_M,
         )
-        lanes = spanned(with_target(body_lanes(front, self.road), vehicles))
+        attended = with_target(body_lanes(front, self.road), vehicles)
+
+        # Per driver and lane, [N, M, 1 to 3]; a wall that lies behind does not count.
+        lanes = spanned(attended)
         keeps = lanes == vehicles.target_lane[..., None]
         acceleration = acceleration_before_wall(scene, lanes, keeps, self.drivers.idm)
         ahead = room_before_wall(vehicles, lanes, self.road) >= 0.0
@@ -209,8 +236,12 @@ def _leaving(choice: Tensor, keeping: Tensor, ways: WaysOut, sides: Tensor, u: T
 
     Recordings show no such lanes, so this is no part of the policy. Like its own changes these
     leave others room.
+
+    ``choice`` [N, M] is the policy's, ``keeping`` whether the driver is in its target lane,
+    ``sides`` [N, M, 2, SIDE_FEATURES], and ``u`` uniform.
     """
     left = ways.side == 1
     side = torch.where(left[..., None], sides[..., 0, :], sides[..., 1, :])
     wants = keeping & (ways.side != 0) & (u < ways.urgency)
-    return torch.where(wants & leaves_room(side, LEAST_ROOM_M), torch.where(left, 1, 2), choice)
+    leaves = wants & leaves_room(side, LEAST_ROOM_M)
+    return torch.where(leaves, torch.where(left, 1, 2), choice)

@@ -34,7 +34,7 @@ _CHANGE = (Purpose.LANE_CHANGE_HAZARD, Purpose.LANE_CHANGE_SIDE)
 def literal_hazard(clock: Tensor, mean_steps: float) -> Tensor:
     """Equation 10: probability ``t / t_m`` per step of a change.
 
-    ``clock`` is the number of steps since the last one ended.
+    ``clock`` is the number of steps since the last one ended, ``mean_steps`` is ``t_m``.
     Read literally the probability grows until a change is certain at ``t = t_m``, so the mean
     waiting time is about ``sqrt(pi t_m / 2)`` steps, not ``t_m``.
     """
@@ -44,7 +44,7 @@ def literal_hazard(clock: Tensor, mean_steps: float) -> Tensor:
 def random_side(u: Tensor, lane: Tensor, lanes: int | Tensor) -> Tensor:
     """A random side with a lane: -1 right, +1 left, 0 on a single-lane road.
 
-    ``u`` uniform, ``lane`` int64.
+    ``u`` uniform in [0, 1), ``lane`` int64 from 0 on the right, of the same shape.
     """
     return _one_of(u, lane < lanes - 1, lane > 0)
 
@@ -65,12 +65,13 @@ def _side(
     if not road.stretches:
         return random_side(u, vehicles.target_lane, road.lanes), None
     ways = ways_out(vehicles, road, mobil.mandatory_m)
-    return torch.where(ways.side != 0, ways.side, _one_of(u, ways.left, ways.right)), ways
+    free = _one_of(u, ways.left, ways.right)
+    return torch.where(ways.side != 0, ways.side, free), ways
 
 
 class LiteralLaneChange(Overlay):
     """The paper's lane changes: hazard ``t / t_m`` per step, blind, at a lateral speed drawn per
-    change.
+    change (equation 10).
 
     Memory: ``clock``, steps since the last change ended (0 at the start, too), and
     ``lateral_speed`` of the current change (m/s, positive to the left, 0 without one).
@@ -104,6 +105,7 @@ class LiteralLaneChange(Overlay):
         dtype = vehicles.x.dtype
         u, u_side = uniforms(vehicles, key, step, *_CHANGE)
         gauss = normal(key, step, vehicles.x.shape[1], [Purpose.LANE_CHANGE_SPEED], dtype)[..., 0]
+
         # Blind: nobody looks for a gap, as in the paper.
         hazard = literal_hazard(memory["clock"].to(dtype), c.mean_steps)
         side, ways = _side(vehicles, self.road, u_side, self.mobil)
@@ -112,10 +114,12 @@ class LiteralLaneChange(Overlay):
         starts = (memory["lateral_speed"] == 0) & vehicles.valid & (u < hazard)
         side = torch.where(starts, side, 0)
         target = vehicles.target_lane + side
+
         # One lateral speed for the whole change.
         drawn = (c.lateral_speed_mps + c.lateral_speed_sd_mps * gauss).clamp_min(c.slowest_mps)
         pace = torch.where(side != 0, drawn, memory["lateral_speed"].abs())
         changing = pace != 0
+
         # Towards the target lane, which may have been set back meanwhile.
         remaining = self.road.centre_of(target, vehicles.y.dtype) - vehicles.y
         lateral = torch.copysign(pace, remaining)
@@ -123,6 +127,7 @@ class LiteralLaneChange(Overlay):
         stride = lateral * self.dt
         arrives = changing & (remaining.abs() <= stride.abs())
         y = vehicles.y + torch.where(arrives, remaining, stride)
+
         # Below 1 m/s the angle would grow without bound.
         heading = torch.atan(lateral / vehicles.speed.clamp_min(1.0))
         moved = moved.with_(
@@ -130,6 +135,7 @@ class LiteralLaneChange(Overlay):
             y=torch.where(changing, y, moved.y),
             heading=torch.where(changing, heading, moved.heading),
         )
+
         # 0 during a change; it counts from the end of the change.
         clock = torch.where(changing, 0, memory["clock"] + 1)
         return moved, {
@@ -142,8 +148,11 @@ class LiteralLaneChange(Overlay):
 class CalibratedLaneChange(Overlay):
     """Lane changes at the recorded rate, after a gap check that considers closing speeds.
 
-    Only the target lane is set: the model below drives there. Memory: ``wish``, the desired side
-    (-1, 0, 1), and ``waited``, the number of steps since it began.
+    Only the target lane is set: the model below drives there. A driver wishes for a side at a
+    constant rate per kilometre, waits for a gap, and gives up after a while.
+
+    Memory: ``wish``, the desired side (-1, 0, 1), and ``waited``, the number of steps since it
+    began.
     """
 
     memory_fields = {  # noqa: RUF012
@@ -166,11 +175,12 @@ class CalibratedLaneChange(Overlay):
         self._limits = self.changes.limits()
 
     def _wishes(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Tensor:
-        """The current wish, or a new one."""
+        """The current wish, or a new one: a side [N, M], -1 right, 0 none, 1 left."""
         u, u_side = uniforms(vehicles, key, step, *_CHANGE)
         # At a constant rate per kilometre driven: the probability of at least one event of a
         # Poisson process within the step.
         comes = u < 1.0 - torch.exp(-vehicles.speed * (self.dt * self.changes.per_km / 1000.0))
+
         side, ways = _side(vehicles, self.road, u_side, self.mobil)
         # Who is still changing does not wish for another change.
         free = lane_change_done(vehicles, self.road) & vehicles.valid
@@ -189,9 +199,13 @@ class CalibratedLaneChange(Overlay):
         pairs = scene.pairs
         target = vehicles.target_lane.to(lane.dtype)
         # Without the ego, whose intention the others do not know.
-        changing = without_ego((self.road.lane_of(vehicles.y) != target) & vehicles.valid)
+        elsewhere = self.road.lane_of(vehicles.y) != target
+        changing = without_ego(elsewhere & vehicles.valid)
+
+        # Pairs [N, M, M]: a driver, and who may contest its lane.
         near = torch.minimum(pairs.ahead, pairs.behind) < self.changes.exclusive_m
-        return (near & changing[:, None, :] & (target[:, None, :] == lane[:, :, None])).any(-1)
+        same_lane = target[:, None, :] == lane[:, :, None]
+        return (near & changing[:, None, :] & same_lane).any(-1)
 
     def rewrite(
         self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
@@ -199,13 +213,17 @@ class CalibratedLaneChange(Overlay):
         """Set the target lane of those whose wish finds a gap."""
         wish = self._wishes(vehicles, memory, key, step)
         scene = perceive(vehicles, self.road)
+
         # As floats, since the lanes of an absent vehicle are infinite.
         lane = (vehicles.target_lane + wish).to(vehicles.x.dtype)
+
         # Neither the driver nor its new follower has to brake harder than the limit, by IDM.
         safe = safe_change(scene, lane, self.idm, self._limits)
         wanted = torch.where(safe & ~self._contested(scene, lane), wish, 0)
         # Two that would start into the same gap at once cannot see each other's intention.
         starts = one_at_a_time(scene, wanted, self.idm, self._limits)
+
+        # Steps since the wish began.
         waited = torch.where(wish != 0, memory["waited"] + 1, 0)
         # Otherwise wishes pile up in dense traffic and all come true when it thins out.
         gives_up = waited >= round(self.changes.patience_s / self.dt)
@@ -258,17 +276,23 @@ class AccelerationOverlay(Overlay):
         dtype = vehicles.x.dtype
         (u,) = uniforms(vehicles, key, step, Purpose.ACCELERATION)
         gauss = normal(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]
+
         # A constant hazard while none is going on.
         # For short steps dt / every_s is the probability within one.
         starts = (memory["left"] == 0) & (u < self.dt / s.every_s) & vehicles.valid
         acceleration = torch.where(starts, s.mean + s.sd * gauss, memory["acceleration"])
+        # Steps that remain, this one included.
         left = torch.where(starts, round(s.lasts_s / self.dt), memory["left"])
         moved = _accelerated(vehicles, moved, left > 0, acceleration, self.dt)
         return moved, {"acceleration": acceleration, "left": (left - 1).clamp_min(0)}
 
 
 class Guard(Overlay):
-    """Bound the acceleration, pull towards the target lane, keep the body on the road."""
+    """Bound the acceleration, pull towards the target lane, keep the body on the road.
+
+    The acceleration of IDM is the lower bound, less a slack that grows with the speed; the upper
+    one is IDM's at a shorter headway. Without memory.
+    """
 
     def __init__(
         self,
@@ -290,10 +314,13 @@ class Guard(Overlay):
         scene = perceive(vehicles.with_(target_lane=moved.target_lane), self.road)
         lanes = spanned(scene.attention)
         ahead = leader(scene, lanes)
+
+        # Bounds [N, M], m/s2.
         highest = acceleration_in(scene, lanes, ahead, self.closest)
         lowest = acceleration_in(scene, lanes, ahead, self.idm)
         lowest = lowest - g.slack * vehicles.speed / vehicles.desired_speed
         highest, lowest = (bound.clamp_min(g.hardest_braking) for bound in (highest, lowest))
+
         # What the chain made of it, whichever part moved the vehicle.
         wanted = (moved.speed - vehicles.speed) / self.dt
         # Where the bounds cross, the upper one holds: keeping off the leader comes first.
@@ -309,18 +336,22 @@ class Guard(Overlay):
         g = self.guard
         road = self.road
         offset = road.centre_of(moved.target_lane, moved.y.dtype) - vehicles.y
+
         # PD: keep a share of the lateral motion, and add a pull to the centre.
         damped = vehicles.y + g.damping * (moved.y - vehicles.y)
         pulled = damped + g.centring_per_s * self.dt * offset
         y = torch.where(offset.abs() < 0.5 * road.lane_width_m, pulled, moved.y)
+
         # First the edges for a straight body; the heading of a turned one is bounded below.
         half = 0.5 * moved.width
         left = road.left_edge_m() - g.edge_margin_m
         right = road.right_edge_m() + g.edge_margin_m
         y = y.clamp(right + half, left - half)
+
         # A standing vehicle has no direction of its own, so the divisor is bounded.
         heading = torch.atan((y - vehicles.y) / ((moved.x - vehicles.x).clamp_min(0.1)))
         heading = torch.where(y == moved.y, moved.heading, heading)
+
         # A turned body is wider by half its length times the sine, which the angle exceeds.
         room = torch.minimum(left - y, y - right) - half
         steepest = (room / (0.5 * moved.length)).clamp(0.0, g.steepest_rad)

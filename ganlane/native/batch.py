@@ -219,8 +219,8 @@ class NativeBatch:
 
     def _part_of(self, part: DriverPart, common: dict[str, Any]) -> _Part:
         """What drives the rows of a part of the drivers."""
-        highway = self._highway
         env = self.config.env
+        highway = self._highway
         layout = Layout(part.memory, highway)
         # A single part drives all rows.
         row_list = np.zeros(self.rows, np.int64) if len(self._turns) > 1 else None
@@ -242,13 +242,13 @@ class NativeBatch:
         )
 
         episode = env.episode_parameters()
-        members = common | {
+        specific = {
             "settings": decision_settings(highway, part.drivers, episode, env.ego, env.mobil),
             "inputs": self._pointers(layout.inputs, row_list),
             "outputs": self._pointers(layout.outputs),
             "spawn": spawn,
         }
-        batch = filled(_Batch, members)
+        batch = filled(_Batch, common | specific)
         return _Part(batch, ctypes.byref(batch), row_list, rows_per_thread(part.drivers))
 
     def __getstate__(self) -> dict[str, Any]:

@@ -206,7 +206,6 @@ class Backdrop:
         """
         window = self.window
         is_leftmost = lane == window.lanes - 1
-        is_rightmost = lane == 0
         far_m = window.length_m * 2.0
         # Within the picture's surroundings, since pixels of a lane without an end would overflow.
         ends = np.clip([stretch.begin_m, stretch.end_m], ego_x_m - far_m, ego_x_m + far_m)
@@ -217,7 +216,7 @@ class Backdrop:
         upper, lower = window.row(sides).tolist()
         # The outermost lanes have an edge of asphalt.
         top = upper - 6 if is_leftmost else upper + 2
-        bottom = lower + 6 if is_rightmost else lower - 2
+        bottom = lower + 6 if lane == 0 else lower - 2
 
         # Columns before and behind the lane: there is no road at one, and a ramp at the other.
         before = (0.0, begin)
@@ -236,5 +235,5 @@ class Backdrop:
             return
         if not is_leftmost:
             draw.line((left, upper, right, upper), fill=VERGE, width=6)
-        if not is_rightmost:
+        if lane > 0:
             draw.line((left, lower, right, lower), fill=VERGE, width=6)

@@ -142,8 +142,7 @@ class FramePainter:
 
         if self.look.speeds:
             place = (column - 0.09 * forward[0], middle[1] - SMALL * 0.62)
-            ink = canvas.readable_on(colour)
-            put_text(picture, place, f"{speed:.0f}", ink, anchor=0.5)
+            put_text(picture, place, f"{speed:.0f}", canvas.readable_on(colour), anchor=0.5)
 
     def _layers(self, frame: int, vehicle: int, colour: str) -> list[tuple[FloatArray, str]]:
         """What a vehicle of this colour is drawn of, outlines and their colours, the lowest first.
@@ -160,8 +159,8 @@ class FramePainter:
             edge = canvas.CRASH
         outline = _EGO if is_ego else _BODY
         # An edge that says something is broader.
-        inside = outline * (0.86 if overlaps or is_ego else 0.93)
-        layers = [(outline, edge), (inside, colour)]
+        inside = 0.86 if overlaps or is_ego else 0.93
+        layers = [(outline, edge), (outline * inside, colour)]
 
         if trajectory.acceleration[at] < _BRAKE_LIGHT:
             layers += [(_BRAKE, canvas.BRAKE), (_BRAKE * _MIRROR, canvas.BRAKE)]

@@ -27,49 +27,65 @@ _EGO = slice(0, 1)
 
 
 def first_marks(rows: Tensor) -> TensorDict:
-    """The marks of rows whose episode begins, for ``rows`` of any type, [N]."""
+    """The marks of rows whose episode begins, for ``rows`` of any type, [N].
+
+    Nothing has come near, nobody has braked, and the last lane change is endlessly long ago.
+    """
     endless = torch.full(rows.shape, torch.inf, device=rows.device)
     marks = dict.fromkeys(LEAST, endless)
     marks["hardest_braking_mps2"] = torch.zeros_like(endless)
-    return TensorDict({**marks, "change_s": -endless}, rows.shape).clone()
+    marks["change_s"] = -endless
+    # Each mark gets a tensor of its own.
+    return TensorDict(marks, rows.shape).clone()
 
 
 def marks_after(state: TensorDictBase, marks: TensorDictBase, road: Road) -> TensorDictBase:
     """``marks`` [N] after the decision that led to ``state`` [N].
 
-    :data:`LEAST`, and ``change_s``, the time at which the last lane change began.
+    :data:`LEAST`, and ``change_s``, the time at which the last lane change began, s. An environment
+    without ``vehicles`` has no marks to update.
     """
     if keys.VEHICLES not in state:
         return marks
     ego = state[keys.EGO]
     vehicles = Vehicles.of(state[keys.VEHICLES])
     here = road_in(state, road)
+
+    # The vehicle ahead of the ego in the lane of its centre, [N, 1].
     lane = here.lane_of(vehicles.y[:, _EGO])
     ahead = leader(perceive(vehicles, here, _EGO), lane)
     # Who overlaps along the road, half in the lane, is as near as can be.
     gap_m = ahead.gap[:, 0].clamp_min(0.0)
     speed = vehicles.speed[:, 0]
     closing = speed - ahead.speed[:, 0]
+
     now = {
         "least_ttc_s": torch.where(closing > 0.0, gap_m / closing, torch.inf),
         "least_headway_s": torch.where(speed > 0.0, gap_m / speed, torch.inf),
         "hardest_braking_mps2": ego["mean_acceleration"],
     }
-    least = {name: torch.minimum(marks[name], value.float()) for name, value in now.items()}
+    updated = {name: torch.minimum(marks[name], value.float()) for name, value in now.items()}
+
     time_s = state[keys.STEP] * keys.PHYSICS_STEP_S
-    change_s = torch.where(ego["started_change"], time_s.float(), marks["change_s"])
-    return TensorDict({**least, "change_s": change_s}, marks.batch_size)
+    updated["change_s"] = torch.where(ego["started_change"], time_s.float(), marks["change_s"])
+    return TensorDict(updated, marks.batch_size)
 
 
 def crash_kinds(vehicles: Vehicles, since_s: Tensor, road: Road = STRAIGHT) -> list[str]:
-    """One of :data:`CRASHES` for every row [N], as if it had crashed; ``since_s`` [N] is the time
-    since its last lane change began.
+    """One of :data:`CRASHES` for every row [N], as if it had crashed.
+
+    Args:
+        vehicles: [N, M], the ego first.
+        since_s: time since the ego's last lane change began, s, [N].
     """
     hit = ego_overlaps(vehicles, road)
     lanes = road.lane_of(vehicles.y[:, 1:])
     in_chosen_lane = (hit & (lanes == vehicles.target_lane[:, _EGO])).any(-1)
+
+    # Indices into CRASHES. Soon after a change: struck in the lane chosen, or in the one left.
     struck = torch.where(in_chosen_lane, 1, 2)
     kind = torch.where(since_s <= CHANGE_S, struck, 3)
+    # Whoever runs into somebody does so with or without a change.
     kind = torch.where(ego_at_fault(vehicles, road), 0, kind)
     return [CRASHES[number] for number in kind.tolist()]
 
@@ -81,33 +97,42 @@ def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     other: a rule of geometry, no law. A driver that cuts in and is struck from behind is not at
     fault by it.
     """
+    # The others as seen from the ego, [N, M - 1].
     ahead = road.distance_ahead(vehicles.x[:, :1], vehicles.x[:, 1:])
+    to_the_left = _gain(vehicles.y)
     along = vehicles.speed * torch.cos(vehicles.heading)
     across = vehicles.speed * torch.sin(vehicles.heading)
+
     # Two bodies met along the axis on which their extents began to overlap last. Headings are
     # small, so the axes are those of the road.
     since_along = _time_since(ahead, _gain(along), vehicles.length)
-    since_across = _time_since(_gain(vehicles.y), _gain(across), vehicles.width)
-    # Signs as seen from the ego: who has the higher speed towards the other pushes.
-    towards = torch.sign(_gain(vehicles.y))
+    since_across = _time_since(to_the_left, _gain(across), vehicles.width)
+
+    # Across the road: who has the higher speed towards the other pushes.
+    towards = torch.sign(to_the_left)
     pushes = towards * across[:, :1] > -towards * across[:, 1:]
     at_fault = torch.where(since_along < since_across, ahead > 0, pushes)
     into_somebody = (at_fault & ego_overlaps(vehicles, road)).any(-1)
+
     if not road.has_lane_ends:
         return into_somebody
-    ego = vehicles.columns(slice(0, 1))
+    ego = vehicles.columns(_EGO)
     return into_somebody | hits_wall(ego, body_lanes(ego, road), road)[:, 0]
 
 
 def _gain(values: Tensor) -> Tensor:
-    """What the others have more than the ego, [N, M - 1]."""
+    """What the others have more than the ego, [N, M - 1], of ``values`` [N, M]."""
     return values[:, 1:] - values[:, :1]
 
 
 def _time_since(distance: Tensor, speed: Tensor, sizes: Tensor) -> Tensor:
-    """For how long (s) the extents of the ego and the others overlap, [N, M - 1].
+    """For how long the extents of the ego and the others overlap on an axis, s, [N, M - 1].
 
-    Infinite where they do not close. ``sizes`` [N, M] are of all bodies, m.
+    Infinite where they do not close.
+
+    Args:
+        distance, speed: of the others relative to the ego on that axis, m and m/s, [N, M - 1].
+        sizes: of all bodies, m, [N, M].
     """
     # Distance of two centres at which the bodies touch.
     reach = 0.5 * (sizes[:, 1:] + sizes[:, :1])

@@ -22,7 +22,7 @@ from ganlane.native.batch import Stepped
 from ganlane.native.settings import Array, Key
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.observation import largest_number
-from ganlane.sim.state import road_in
+from ganlane.sim.state import Road, road_in
 
 
 class TensorRows(Rows):
@@ -34,13 +34,17 @@ class TensorRows(Rows):
     """
 
     def __init__(self, config: HighwayConfig, transforms: Sequence[Transform] = ()) -> None:
-        self.config, self.transforms = config, transforms
+        self.config = config
+        self.transforms = transforms
+        self.count = config.num_envs
+
         self.env = make_highways(config)
         for transform in transforms:
             self.env.append_transform(transform)
+        # The simulator below all transforms.
         base = self.env.base_env
-        self.count = config.num_envs
         self.episode = base.episode
+
         size = self.env.observation_spec[keys.OBSERVATION].shape[-1]
         # One form counts metres of overlap, so its bound follows from the longest vehicle.
         largest = largest_number(config.observation.form, base.scenes.longest_m)
@@ -51,8 +55,8 @@ class TensorRows(Rows):
     @torch.no_grad()
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
         counters = TensorDict({}, [self.count], device=self.env.device)
-        for name, value in ((keys.SEED, seed), (keys.EPISODE, episode)):
-            # One number for all rows, or one for each.
+        for name, value in {keys.SEED: seed, keys.EPISODE: episode}.items():
+            # One number for all rows, or one for each: [N].
             numbers = np.broadcast_to(value, self.count).astype(np.int64)
             counters[name] = torch.as_tensor(numbers, device=self.env.device)
         self.state = self.env.reset(counters)
@@ -60,15 +64,20 @@ class TensorRows(Rows):
 
     @torch.no_grad()
     def restart(self, rows: Flags) -> None:
+        # TorchRL resets where its flag [N, 1] is set, and leaves the other rows alone.
         mask = torch.as_tensor(rows, device=self.env.device)[:, None]
-        self.state = self.env.reset(self.now().set("_reset", mask))
+        flagged = self.now().set("_reset", mask)
+        self.state = self.env.reset(flagged)
 
     @torch.no_grad()
     def step(self, actions: Integers | Floats) -> Stepped:
         action = torch.as_tensor(actions, device=self.env.device)
-        stepped = self.env.step(self.now().set(keys.ACTION, action))
+        commanded = self.now().set(keys.ACTION, action)
+        stepped = self.env.step(commanded)
         # Rows are not reset here: the environments above decide when.
         self.state = self.env.step_mdp(stepped)
+
+        # TorchRL's rewards and ends are [N, 1], gymnasium's [N].
         names = (keys.REWARD, "terminated", "truncated")
         reward, *ends = (_array(stepped["next", name][:, 0]) for name in names)
         return Stepped(self.observation(), reward.astype(np.float32), *ends)
@@ -88,8 +97,7 @@ class TensorRows(Rows):
         # An environment with a mask has computed it; without one it is the actions on the road.
         mask = state.get(keys.ACTION_MASK, None)
         if mask is None:
-            road = road_in(state, self.env.base_env.road)
-            mask = legal_actions(state, road, self.actions)
+            mask = legal_actions(state, self._road(), self.actions)
         return _array(mask)
 
     def array(self, key: Key) -> Array:
@@ -98,10 +106,15 @@ class TensorRows(Rows):
         return array[:, EGO_INDEX] if array.ndim > 1 else array
 
     def lanes(self) -> tuple[Any, Any]:
-        road = road_in(self.now(), self.env.base_env.road)
+        road = self._road()
         # One number for all rows, or [N, 1].
-        lanes, width_m = map(torch.as_tensor, (road.lanes, road.lane_width_m))
+        lanes = torch.as_tensor(road.lanes)
+        width_m = torch.as_tensor(road.lane_width_m)
         return _array(lanes.flatten()), _array(width_m.flatten())
+
+    def _road(self) -> Road:
+        """The road of the rows: of their recorded scenes, else that of the settings."""
+        return road_in(self.now(), self.env.base_env.road)
 
     def reward_terms(self) -> dict[str, Array]:
         terms = self.now().get(keys.REWARD_TERMS).items()
@@ -109,4 +122,5 @@ class TensorRows(Rows):
 
 
 def _array(tensor: Tensor) -> npt.NDArray[Any]:
+    """As NumPy array, on a CPU without a copy."""
     return tensor.cpu().numpy()

@@ -27,6 +27,7 @@ from ganlane.native.drivers import (
     rows_per_thread,
     turns_of,
 )
+from ganlane.native.drivers import Part as DriverPart
 from ganlane.native.library import addresses, in_threads, load, load_for
 from ganlane.native.settings import Array, Floats, Highway, Key, Layout, fields, filled, within
 from ganlane.settings.actions import CONTROLS, LANE, LANE_SPEED
@@ -98,8 +99,9 @@ class _Part(NamedTuple):
 
     def drive(self, decide: Callable[..., int], count: int) -> None:
         """The first ``count`` of ``rows``."""
-        pointers = (self.batch.settings, self.batch.inputs, self.batch.outputs)
-        in_threads(count, lambda first, last: decide(*pointers, first, last), self.rows_per_thread)
+        batch = self.batch
+        decide_part = partial(decide, batch.settings, batch.inputs, batch.outputs)
+        in_threads(count, decide_part, self.rows_per_thread)
 
 
 class NativeBatch:
@@ -123,49 +125,82 @@ class NativeBatch:
         self.config = config
         # For copies and other processes, which make the batch anew.
         self._arguments = (config, drivers, variant)
-        env, mask, form = config.env, config.mask, config.observation.form
-        episode, spawn, actions = env.episode_parameters(), env.spawn_parameters(), env.actions
-        flow = env.flow if env.flow.is_on else None
-        road = (env.lanes, env.lane_width_m, env.vehicles)
-        highway = Highway(*road, env.stretches(), flow, actions)
-        self.rows = rows = config.num_envs
+        self.rows = config.num_envs
         self.terms = config.reward.term_names
-        view = settings.view_of(highway, config.observation, form)
+
+        env = config.env
+        flow = env.flow if env.flow.is_on else None
+        self._highway = Highway(
+            env.lanes, env.lane_width_m, env.vehicles, env.stretches(), flow, env.actions
+        )
+
+        # Bounds of the observation's numbers; some count metres of the longest vehicle.
         scene = env.scenes()
-        longest_m = spawn.longest_m if scene is None else scene.longest_m
-        self.bounds = (-1.0, largest_number(form, longest_m))
-        # All arrays of the state in place, written by the kernel and read by whoever asks.
-        layout = Layout(drivers.memory(), highway)
-        self.state: dict[Key, Array] = {
-            name: np.zeros(layout.shape(name, rows, env.vehicles), kind)
-            for name, kind in layout.kinds.items()
-        }
-        self.state |= {name: np.zeros(rows, kind) for name, kind in _ROW_ARRAYS.items()}
+        longest_m = env.spawn_parameters().longest_m if scene is None else scene.longest_m
+        self.bounds = (-1.0, largest_number(config.observation.form, longest_m))
+
+        view = settings.view_of(self._highway, config.observation, config.observation.form)
+        self._make_arrays(drivers, view.numbers())
+        # A network fills the widest vectors with its own numbers.
+        widest = variant or by_network(drivers)
+        self._library = load(variant) if widest else load_for(self.rows)
+
+        # Of several parts of the drivers each drives the rows that are its own, by episode.
+        self._turns = np.array(turns_of(drivers))
+        common = self._common_members(drivers, view)
+        self._parts = [self._part_of(part, common) for part in parts_of(drivers)]
+
+        # The arrays stay where they are, so every step returns the same ones.
+        self._stepped = Stepped(
+            self.observation,
+            self.state[keys.REWARD],
+            self.state["terminated"],
+            self.state["truncated"],
+        )
+
+    def _make_arrays(self, drivers: Drivers, size: int) -> None:
+        """All arrays in place, written by the kernel and read by whoever asks.
+
+        ``size`` is the length D of an observation.
+        """
+        rows = self.rows
+        actions = self._highway.actions
+        layout = Layout(drivers.memory(), self._highway)
+        self.state: dict[Key, Array] = {}
+        for name, kind in (layout.kinds | _ROW_ARRAYS).items():
+            shape = layout.shape(name, rows, self._highway.vehicles)
+            self.state[name] = np.zeros(shape, kind)
+
+        # What the ego is commanded: numbered actions [N], or continuous controls [N, 2].
         self._commands = self.state[keys.ACTION]
         if not actions.names:
             self._commands = self.state["controls"] = np.zeros((rows, CONTROLS), np.float32)
-        self.observation = np.zeros((rows, view.numbers()), np.float32)
+        self.observation = np.zeros((rows, size), np.float32)
+
+        # Of the paper's actions [N, 3], and of all actions [N, A] where there are others.
         self._lane_mask = np.ones((rows, keys.ACTIONS), np.bool_)
         self.mask = self._lane_mask
         if actions.form != LANE:
             self.mask = np.ones((rows, len(actions.names)), np.bool_)
+        self._no_safe_action = np.zeros(rows, np.bool_)
+
+        # [N, terms], and a view of the first row.
         self._term_values = np.zeros((rows, len(self.terms)), np.float32)
         self._first_terms = self._term_values[0]
-        self._no_safe_action = np.zeros(rows, np.bool_)
-        # A network fills the widest vectors with its own numbers.
-        widest = variant or by_network(drivers)
-        self._library = load(variant) if widest else load_for(rows)
-        abort = env.ego.abort_lane_change
-        # The kernel's structures, filled once.
+
+    def _common_members(self, drivers: Drivers, view: settings.View) -> dict[str, Any]:
+        """The members of :class:`_Batch` that all parts share."""
+        config = self.config
+        abort = config.env.ego.abort_lane_change
         reward = vars(config.reward) | {
-            "decision_period_s": episode.decision_period_s,
+            "decision_period_s": config.env.episode_parameters().decision_period_s,
             "terms": len(self.terms),
         }
-        numbers = highway._asdict() | {
+        return self._highway._asdict() | {
             "reward_settings": filled(settings.Reward, reward),
             "view": view,
             "view_inputs": self._pointers(_VIEWS),
-            "mask_settings": mask_settings(highway, drivers.idm, mask, abort),
+            "mask_settings": mask_settings(self._highway, drivers.idm, config.mask, abort),
             "mask_inputs": self._pointers(_MASKS),
             "mask_outputs": addresses([self._lane_mask, self._no_safe_action]),
             "scene": self._pointers(settings.STARTS),
@@ -173,39 +208,48 @@ class NativeBatch:
             "terms": self._term_values,
             "observation": self.observation,
             "mask": self._lane_mask,
-            "speed_mask": self.mask if actions.form == LANE_SPEED else None,
+            "speed_mask": self.mask if self._highway.actions.form == LANE_SPEED else None,
             "lowest": self.bounds[0],
             "highest": self.bounds[1],
             "fastest": SPEED_RATIO_LIMIT,
             "size": view.numbers(),
-            "mask_form": MASKS.index(mask.form),
+            "mask_form": MASKS.index(config.mask.form),
             "abort_lane_change": abort,
         }
+
+    def _part_of(self, part: DriverPart, common: dict[str, Any]) -> _Part:
+        """What drives the rows of a part of the drivers."""
+        env = self.config.env
+        highway = self._highway
+        layout = Layout(part.memory, highway)
+        # A single part drives all rows.
+        row_list = np.zeros(self.rows, np.int64) if len(self._turns) > 1 else None
+
         recycle_share = env.recycle_share if env.recycle else None
-        if flow is not None:
+        if highway.flow is not None:
             # In every episode vehicles enter and leave.
             recycle_share = 1.0
-        self._turns = np.array(turns_of(drivers))
-        self._parts = []
-        for part in parts_of(drivers):
-            layout = Layout(part.memory, highway)
-            # Of several parts each drives the rows that are its own.
-            row_list = np.zeros(rows, np.int64) if len(self._turns) > 1 else None
-            # When others see the ego's lane changes, and the ego theirs.
-            others = part.drivers.visibility
-            visible = (Visibility.named(env.ego.visibility), others)
-            start = (Stream.named(config.stream), *visible, recycle_share, env.scenes(others))
-            of_part = {
-                "settings": decision_settings(highway, part.drivers, episode, env.ego, env.mobil),
-                "inputs": self._pointers(layout.inputs, row_list),
-                "outputs": self._pointers(layout.outputs),
-                "spawn": settings.spawn_of(highway, spawn, *start),
-            }
-            batch = filled(_Batch, numbers | of_part)
-            per_thread = rows_per_thread(part.drivers)
-            self._parts.append(_Part(batch, ctypes.byref(batch), row_list, per_thread))
-        ends = (self.state["terminated"], self.state["truncated"])
-        self._stepped = Stepped(self.observation, self.state[keys.REWARD], *ends)
+        # When others see the ego's lane changes, and the ego theirs.
+        visibility = part.drivers.visibility
+        spawn = settings.spawn_of(
+            highway,
+            env.spawn_parameters(),
+            Stream.named(self.config.stream),
+            Visibility.named(env.ego.visibility),
+            visibility,
+            recycle_share,
+            env.scenes(visibility),
+        )
+
+        episode = env.episode_parameters()
+        specific = {
+            "settings": decision_settings(highway, part.drivers, episode, env.ego, env.mobil),
+            "inputs": self._pointers(layout.inputs, row_list),
+            "outputs": self._pointers(layout.outputs),
+            "spawn": spawn,
+        }
+        batch = filled(_Batch, common | specific)
+        return _Part(batch, ctypes.byref(batch), row_list, rows_per_thread(part.drivers))
 
     def __getstate__(self) -> dict[str, Any]:
         """What it was made of, and its numbers.
@@ -221,26 +265,36 @@ class NativeBatch:
             array[:] = numbers
 
     def _arrays(self) -> list[Array]:
+        """All that changes from step to step."""
         return [*self.state.values(), self.observation, self.mask, self._term_values]
 
     def _pointers(
         self, names: Iterable[Key], rows: Array | None = None
     ) -> ctypes.Array[ctypes.c_void_p]:
+        """Addresses of arrays of the state, null for those that it lacks.
+
+        The array named ``"rows"`` is ``rows``.
+        """
         arrays: dict[Key, Any] = {**self.state, "rows": rows}
         return addresses([arrays.get(name) for name in names])
 
     def start(
         self, seed: npt.ArrayLike, episode: npt.ArrayLike, rows: npt.NDArray[np.bool_] | None = None
     ) -> None:
-        """Begin the episodes [N] of the seeds [N], each perhaps one number for all, in ``rows`` [N]
-        (None: all).
+        """Begin episodes.
+
+        Args:
+            seed, episode: whole numbers, [N], or one for all rows.
+            rows: flags [N] of those to start; None: all.
         """
         state = self.state
-        fresh = state["fresh"]
         # The kernel starts the rows whose flag is set and leaves the others alone.
+        fresh = state["fresh"]
         fresh[:] = True if rows is None else rows
         np.copyto(state[keys.SEED], seed, where=fresh)
         np.copyto(state[keys.EPISODE], episode, where=fresh)
+
+        # Of several parts each starts its own rows.
         starting = fresh.copy()
         for number, part in enumerate(self._parts):
             if part.rows is not None:
@@ -248,26 +302,34 @@ class NativeBatch:
             part.call(self._library.ganlane_start, self.rows)
 
     def _part_of_row(self) -> npt.NDArray[np.int64]:
+        """Which part drives each row, [N]; parts take turns with the episodes."""
         return self._turns[self.state[keys.EPISODE] % len(self._turns)]
 
     def step(self, actions: Array) -> Stepped:
-        """One decision of every row, by the actions [N] or [N, 2]; no row is reset."""
+        """One decision of every row; no row is reset.
+
+        Args:
+            actions: numbers of actions [N], or continuous controls [N, 2].
+        """
         # Copied, since the kernel holds the address of this array.
         self._commands[:] = actions
         if len(self._parts) == 1:
             self._parts[0].call(self._library.ganlane_step, self.rows)
             return self._stepped
+
+        # Each part drives its rows, listed at the front of its array.
         part_of_row = self._part_of_row()
         for number, part in enumerate(self._parts):
             chosen = np.flatnonzero(part_of_row == number)
             assert part.rows is not None
             part.rows[: len(chosen)] = chosen
             part.drive(self._library.ganlane_decide, len(chosen))
+        # Reward, mask and observation do not depend on who drove.
         self._parts[0].call(self._library.ganlane_judge, self.rows)
         return self._stepped
 
     def first_reward_terms(self) -> dict[str, float]:
-        """Those of the first row."""
+        """The terms of the last reward of the first row, by name."""
         return dict(zip(self.terms, self._first_terms.tolist()))
 
     def reward_terms(self) -> dict[str, Floats]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -32,15 +33,19 @@ from ganlane.view.figures import (
 def card_text(numbers: Mapping[str, Any]) -> list[str]:
     """The card's tables, of the ``numbers`` in ``results.json``."""
     traffic = numbers["traffic"]
-    held_out = numbers["quantities_held_out"]
+
     # All scenes first; what was held out from the fit apart, where both were driven.
     tables = [quantities_table(numbers["quantities"], traffic)]
+    held_out = numbers["quantities_held_out"]
     if held_out is not None:
         tables.append(f"held-out scenes alone\n{quantities_table(held_out, traffic)}")
     tables.append(starts_table(numbers["driving"]))
+
     # A second site, to which nothing was fitted.
     for name, rows in numbers["i80"].items():
         tables.append(f"{name}\n{quantities_table(rows, traffic)}")
+
+    # The traffic first, then its rivals.
     long_runs = {traffic: numbers["long_runs"], **numbers["long_runs_against"]}
     for name, runs in long_runs.items():
         if runs:
@@ -49,9 +54,13 @@ def card_text(numbers: Mapping[str, Any]) -> list[str]:
 
 
 def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
-    """Distances, one quantity per line.
+    """Jensen-Shannon distances to recorded driving, from 0 to 1, one quantity per line.
 
     The traffic, the scale, and each rival with the difference to it.
+
+    Args:
+        quantities: rows of :func:`ganlane.realism.card.card_rows` by quantity.
+        traffic: name of the traffic that the card is about.
     """
     # All rows have the same rivals.
     rivals = list(next(iter(quantities.values()))["against"])
@@ -59,6 +68,7 @@ def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
     heading = ["distance to recorded", ours, "ceiling", "constant v", "random"]
     for rival in map(short_name, rivals):
         heading += [rival, f"minus {rival} [95 %]", ""]
+
     lines = [heading]
     for name, row in quantities.items():
         line = [f"{name}, {row['unit']}", with_interval(row, "distance")]
@@ -82,21 +92,25 @@ def starts_table(driving: Mapping[str, Any]) -> str:
     lines = [["from the same starts", rate, "vehicle-km", "acceleration 5 %, 95 %"]]
     for name, row in driving.items():
         acceleration = row["quantiles"]["acceleration"]
-        line = [
-            short_name(name),
-            with_interval(row, "per_vehicle_km", 2),
-            number(row["vehicle_km"], 1),
-            f"{number(acceleration['0.05'], 2)}, {number(acceleration['0.95'], 2)}",
-        ]
-        lines.append(line)
+        lines.append(
+            [
+                short_name(name),
+                with_interval(row, "per_vehicle_km", 2),
+                number(row["vehicle_km"], 1),
+                f"{number(acceleration['0.05'], 2)}, {number(acceleration['0.95'], 2)}",
+            ]
+        )
     return aligned(lines)
 
 
 def long_table(runs: Sequence[Mapping[str, Any]], traffic: str) -> str:
     """The long runs of a traffic, one column each."""
-    # All runs have the same lines.
     columns = [_run_cells(run, traffic) for run in runs]
-    return aligned([[name, *(column[name] for column in columns)] for name in columns[0]])
+    lines = []
+    # All runs have the same lines.
+    for name in columns[0]:
+        lines.append([name, *(column[name] for column in columns)])
+    return aligned(lines)
 
 
 def _run_cells(run: Mapping[str, Any], traffic: str) -> dict[str, str]:
@@ -125,11 +139,14 @@ def short_name(traffic: str) -> str:
 
 def draw(numbers: Mapping[str, Any], starts: Starts, to: Path) -> None:
     """The figures of a card, distributions and distances, into the folder ``to``."""
-    # The reference drivers would hide the others.
-    simulated = {name: starts.driven[name] for name in starts.driven if name not in FLOORS}
-    totals = {short_name(name): _pooled(measured) for name, measured in simulated.items()}
+    totals = {}
+    for name, measured in starts.driven.items():
+        # The reference drivers would hide the others.
+        if name not in FLOORS:
+            totals[short_name(name)] = _pooled(measured)
     distributions = draw_distributions(_pooled(starts.recorded), totals)
     save_figure(distributions, to / "distributions.png")
+
     distances = draw_distances(numbers["quantities"], numbers["traffic"])
     save_figure(distances, to / "distances.png")
 
@@ -143,37 +160,43 @@ def _pooled(measured: Measured) -> dict[str, FloatArray]:
 def draw_distributions(
     recorded: Mapping[str, FloatArray], simulated: Mapping[str, Mapping[str, FloatArray]]
 ) -> Figure:
-    """A panel per quantity.
+    """A panel per quantity: the recorded density and each traffic's, none where it has no samples.
 
-    The recorded density, and each traffic's, from counts [bins] (none where all are 0).
+    Args:
+        recorded: counts [bins] by quantity.
+        simulated: the same by traffic.
     """
     figure, grid = panel_grid(len(recorded))
     # The recordings are black everywhere.
     colours = {"recorded": INK, **palette(list(simulated))}
+    # They come last, on top.
+    drivers = {**simulated, "recorded": recorded}
     for axes, name in zip(grid, recorded):
         edges = QUANTITIES[name].edges
         unit = QUANTITIES[name].unit.replace("s2", "s²").replace("s3", "s³")
-        middle = 0.5 * (edges[1:] + edges[:-1])
         axes.set(title=name.replace("_", " "), xlabel=unit, ylabel=f"density, per {unit}")
         axes.set_xlim(edges[0], edges[-1])
-        # The recordings come last, on top.
-        for driver, by_quantity in {**simulated, "recorded": recorded}.items():
-            counts = by_quantity[name]
-            total = float(counts.sum())
-            if not total:
-                continue
-            # Densities, so that traffics with more samples are not higher.
-            density = counts / total / np.diff(edges)
-            style: Any = {"color": colours[driver]}
-            plot_line(axes, middle, density, **style)
-            # The bins at both ends hold all values beyond, too.
-            for end, mark in ((0, "<"), (-1, ">")):
-                if counts[end]:
-                    axes.plot(middle[end], density[end], mark, clip_on=False, **style)
-    label = "and all values beyond"
-    beyond = Line2D([], [], color=FAINT, label=label, marker=">", ls="")
+        for driver, by_quantity in drivers.items():
+            _draw_density(axes, edges, by_quantity[name], colours[driver])
+
+    beyond = Line2D([], [], color=FAINT, label="and all values beyond", marker=">", ls="")
     add_legend(figure, colours, [beyond])
     return figure
+
+
+def _draw_density(axes: Axes, edges: FloatArray, counts: FloatArray, colour: str) -> None:
+    """A line of the density in bins with these ``edges`` [bins + 1], from ``counts`` [bins]."""
+    total = float(counts.sum())
+    if not total:
+        return
+    # Densities, so that traffics with more samples are not higher.
+    density = counts / total / np.diff(edges)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    plot_line(axes, middle, density, color=colour)
+    # The bins at both ends hold all values beyond, too.
+    for end, mark in ((0, "<"), (-1, ">")):
+        if counts[end]:
+            axes.plot(middle[end], density[end], mark, clip_on=False, color=colour)
 
 
 @rc_context(STYLE)
@@ -183,27 +206,32 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
     ``quantities`` are the rows of :func:`ganlane.realism.card.card_rows`. Vertical lines are
     the ends of the scale: recordings against each other, and random driving.
     """
-    colours = palette([traffic, *next(iter(quantities.values()))["against"]])
+    # All rows have the same rivals.
+    rivals = next(iter(quantities.values()))["against"]
+    colours = palette([traffic, *rivals])
     # The best that can be expected, and the worst that makes sense.
     scale = {"ceiling": ("half against half", INK), "floor": ("random", FAINT)}
-    # A line per traffic, and an empty one.
+
+    # A line per traffic, and an empty one; from top to bottom.
     block = len(colours) + 1
     figure = Figure(figsize=(7.5, 0.8 + 0.125 * block * len(quantities)))
     axes = figure.subplots()
     axes.set(xlim=(0, 1), ylim=(block * len(quantities), 0))
     axes.set_xlabel("Jensen-Shannon distance to recorded driving")
     names = [name.replace("_", " ") for name in quantities]
-    middles = [block * (index + 0.5) for index in range(len(names))]
+    middles = block * (np.arange(len(names)) + 0.5)
     axes.set_yticks(middles, names, color=INK, size=9)
     axes.tick_params("y", length=0)
     axes.grid(False, axis="y")
+
     for index, row in enumerate(quantities.values()):
-        # Quantities from top to bottom, traffics within each in the order of the legend.
         top = block * index
         axes.axhline(top, color=GRID, lw=0.8)
         for mark, (_, colour) in scale.items():
             if row[mark] is not None:
                 axes.vlines(row[mark], top + 0.3, top + block - 0.3, color=colour, lw=1.6)
+
+        # Traffics in the order of the legend.
         for y, (driver, colour) in enumerate(colours.items(), top + 1):
             shown = row if driver == traffic else row["against"][driver]
             # A quantity without samples has no mark.
@@ -211,6 +239,7 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
             if value is not None:
                 axes.plot(shown["distance_ci"] or [value, value], [y, y], color=colour)
                 axes.plot(value, y, "o", color=colour, ms=5)
+
     # Marks of the scale, which no traffic has.
     marks = [
         Line2D([], [], color=colour, label=name, marker="|", ls="", ms=10)

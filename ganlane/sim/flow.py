@@ -34,7 +34,10 @@ _CHOICE_BITS = 24
 
 
 def has_left(vehicles: Vehicles, road: Road, flow: FlowParameters) -> Tensor:
-    """Whether each vehicle has passed the end of the section or of the exit lane, bool [N, M]."""
+    """Whether each vehicle has passed the end of the section or of the exit lane, bool [N, M].
+
+    The ego never leaves so: that is the end of its episode.
+    """
     left = vehicles.x > flow.to_m
     if road.exit_lane is not None:
         by_exit, _ = at_exit(vehicles, road)
@@ -47,16 +50,22 @@ def _chosen(vehicles: Vehicles, road: Road, wanted: Tensor, number: Tensor) -> T
 
     Args:
         wanted: whether it leaves by the exit, bool [N].
-        number: a random one of each slot, [N, M] int64.
+        number: a random one of each slot, [N, M] int64, below ``2 ** _CHOICE_BITS``.
     """
     slot = torch.arange(vehicles.x.shape[1], device=number.device)
     exits = exiting(road, number)
     other_way = torch.zeros_like(vehicles.valid) if exits is None else exits != wanted[:, None]
+
+    # Who comes keeps its place in its lane, so it has to have completed its last lane change.
     waits = ~vehicles.valid & (slot != EGO_INDEX) & lane_change_done(vehicles, road)
-    # The lowest of those who go where it is wanted, else of the others.
-    rank = torch.where(waits, number + (other_way.long() << _CHOICE_BITS), 1 << (_CHOICE_BITS + 1))
-    first = rank.amin(1, keepdim=True)
-    lowest = torch.where(rank == first, slot, len(slot)).amin(1, keepdim=True)
+
+    # The lowest number of those who go where it is wanted, else of the others: one more bit above
+    # the number puts the latter behind, and the next one those who do not wait.
+    rank = number + (other_way.long() << _CHOICE_BITS)
+    rank = torch.where(waits, rank, 1 << (_CHOICE_BITS + 1))
+    is_first = rank == rank.amin(1, keepdim=True)
+    # Of equal numbers the lowest slot.
+    lowest = torch.where(is_first, slot, len(slot)).amin(1, keepdim=True)
     return waits & (slot == lowest)
 
 
@@ -66,10 +75,13 @@ def _room(vehicles: Vehicles, comes: Tensor, road: Road, idm: IdmParameters) -> 
     ``vehicles`` has it at its new position; ``comes`` bool [N, M] is true of at most one of a row.
     """
     slot = torch.arange(vehicles.x.shape[1], device=vehicles.x.device)
+    # Of who comes, [N, 1]: its slot, its fields, and the lanes that it attends to.
     its = comes.to(torch.uint8).argmax(1, keepdim=True)
     one = Vehicles(*(field.gather(1, its) for field in vehicles))
     lanes = with_target(body_lanes(vehicles, road), vehicles)
     its_lanes = LaneRange(*(lane.gather(1, its) for lane in lanes))
+
+    # Of two at the same position the one with the lower index is ahead.
     distance = vehicles.x - one.x
     ahead = (distance > 0.0) | ((distance == 0.0) & (slot < its))
     return leave_room(one, vehicles, (its_lanes, lanes), distance, ahead, idm).all(1)
@@ -78,22 +90,27 @@ def _room(vehicles: Vehicles, comes: Tensor, road: Road, idm: IdmParameters) -> 
 def let_in_and_out(
     vehicles: Vehicles, road: Road, idm: IdmParameters, key: Tensor, step: Tensor, period_s: float
 ) -> Vehicles:
-    """``vehicles`` after some have left and others have entered.
+    """``vehicles`` [N, M] after some have left and others have entered.
 
     Args:
         road: with a flow.
+        idm: that judges whether there is room.
         key: of the episodes, [N] int64.
         step: physics steps since their start, [N] int64.
         period_s: since the last call, s.
     """
     flow = road.flow
     assert flow is not None
-    arrivals = flow.arrivals(road.stretches, period_s)
     vehicles = vehicles.with_(valid=vehicles.valid & ~has_left(vehicles, road, flow))
+
+    # [N, L, 2] in float64, as the probabilities are: whether somebody arrives, and by the exit.
+    arrivals = flow.arrivals(road.stretches, period_s)
     purposes = [Purpose.FLOW_ARRIVAL, Purpose.FLOW_EXIT]
     u = uniform(key, step, len(arrivals), purposes, torch.float64)
+    # [N, M]: the highest bits of a number of each slot.
     keys = draw_keys(key, step, vehicles.x.shape[1], [Purpose.FLOW_SLOT])[..., 0]
     number = (keys >> (64 - _CHOICE_BITS)) & ((1 << _CHOICE_BITS) - 1)
+
     # Lane by lane, so that nobody enters beside one who has just done so without room.
     for lane, probability in enumerate(arrivals):
         arrives = u[:, lane, 0] < probability
@@ -101,12 +118,16 @@ def let_in_and_out(
             continue
         wanted = u[:, lane, 1] < flow.exit_share
         comes = _chosen(vehicles, road, wanted, number) & arrives[:, None]
+
+        # Moved by whole lanes, who comes is as far from the centre of its lane as before.
         lanes = (lane - vehicles.target_lane).to(vehicles.y.dtype)
-        there = vehicles.with_(
+        moved = vehicles.with_(
             x=torch.where(comes, flow.from_m, vehicles.x),
             y=torch.where(comes, vehicles.y + lanes * road.lane_width_m, vehicles.y),
             target_lane=torch.where(comes, lane, vehicles.target_lane),
         )
-        enters = comes & _room(there, comes, road, idm)[:, None]
-        vehicles = there.with_(valid=vehicles.valid | enters).where(enters, vehicles)
+
+        # Who is turned away waits where it was.
+        enters = comes & _room(moved, comes, road, idm)[:, None]
+        vehicles = moved.with_(valid=vehicles.valid | enters).where(enters, vehicles)
     return vehicles

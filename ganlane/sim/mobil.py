@@ -53,24 +53,29 @@ def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelera
     behind = follower(scene, lanes)
     speed = scene.observers.speed[..., None]
     length = scene.observers.length[..., None]
-    # The new follower with the observer in front of it ...
+
+    # The follower with the observer in front of it ...
     driver = (behind.speed, behind.desired_speed)
     with_it = idm_acceleration(*driver, behind.gap, speed, idm.per_lane())
-    # Without the observer its follower is behind its leader, or alone.
+
+    # ... and without it: behind the observer's leader, or alone.
     free = ahead.gap >= FREE_GAP_M
     leader_speed = torch.where(free, behind.speed, ahead.speed)
     gap = torch.where(free, FREE_GAP_M, behind.gap + length + ahead.gap)
     without = idm_acceleration(*driver, gap, leader_speed, idm.per_lane())
+
     # Nobody behind: nobody is hindered or relieved.
     nobody = ~behind.exists
+    with_it = with_it.masked_fill(nobody, 0.0)
+    without = without.masked_fill(nobody, 0.0)
+
     observer = acceleration_behind(scene, ahead, idm)
     if scene.road.has_lane_ends:
         # Whoever changes into a lane means to keep it.
         keeps = torch.ones_like(lanes, dtype=torch.bool)
-        observer = torch.minimum(observer, acceleration_before_wall(scene, lanes, keeps, idm))
-    return LaneAccelerations(
-        observer, with_it.masked_fill(nobody, 0.0), without.masked_fill(nobody, 0.0)
-    )
+        before_wall = acceleration_before_wall(scene, lanes, keeps, idm)
+        observer = torch.minimum(observer, before_wall)
+    return LaneAccelerations(observer, with_it, without)
 
 
 def mobil_criterion(
@@ -79,11 +84,13 @@ def mobil_criterion(
     mobil: MobilParameters,
     politeness: Tensor | float = 1.0,
 ) -> tuple[Tensor, Tensor]:
-    """Incentive of a change from ``here`` [N, K, 1] to ``there`` [N, K, L], m/s2; whether safe.
+    """MOBIL's two criteria of a change from ``here`` [N, K, 1] to ``there`` [N, K, L].
 
-    ``politeness`` is a factor on both weights, [N, K, 1].
+    Returns the incentive, m/s2, what the driver gains plus what its followers gain, weighted, and
+    whether the change is safe (Kesting et al. 2007): neither the new follower nor the driver brakes
+    harder than ``safe_deceleration``. ``politeness`` is a factor on both weights, [N, K, 1].
     """
-    # What the new follower loses, and what the old one gains.
+    # What the new follower gains (mostly below 0), and what the old one gains.
     burden = there.with_it - there.without
     relief = here.without - here.with_it
     incentive = (
@@ -92,13 +99,14 @@ def mobil_criterion(
         + politeness * mobil.politeness_side * burden
         + politeness * mobil.politeness_rear * relief
     )
-    return incentive, torch.minimum(there.with_it, there.observer) >= -mobil.safe_deceleration
+    hardest = torch.minimum(there.with_it, there.observer)
+    return incentive, hardest >= -mobil.safe_deceleration
 
 
 def safe_change(
     scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: MobilParameters = TABLE_IV
 ) -> Tensor:
-    """MOBIL's safety criterion for a change into ``lane`` [N, K] (float), bool."""
+    """MOBIL's safety criterion for a change into ``lane`` [N, K] (float), bool [N, K]."""
     # Safety does not depend on where the vehicle is now: that lane stands in for it.
     there = lane_accelerations(scene, lane[..., None], idm)
     _, safe = mobil_criterion(there, there, mobil)
@@ -121,24 +129,32 @@ def one_at_a_time(
     Too close means nearer than ``exclusive_m`` (centre to centre), or requiring unsafe braking.
     MOBIL's criteria do not cover this case, since neither vehicle is in that lane yet.
     """
-    wants = wish != 0
     vehicles = scene.vehicles
     if not reads_are_cheap(wish):
         return torch.where(_gives_way(vehicles, scene.road, wish, idm, mobil), 0, wish)
+
     # Rivals are rare: among all pairs a decision of idm_random takes 5 % longer with 1024 rows.
+    wants = wish != 0
     rivals = wants & (wants.sum(1, keepdim=True) > 1)
     rows = rivals.any(1).nonzero()[:, 0]
     if len(rows) == 0:
         return wish
-    # Only their rows, and as many columns as hold all of them.
-    rivals, most = rivals[rows], int(rivals.sum(1).max())
+
+    # Only their rows [R], and as many columns W as hold all of them.
+    rivals = rivals[rows]
+    most = int(rivals.sum(1).max())
     rivals_first = rivals.to(torch.uint8).sort(dim=1, descending=True, stable=True)
     columns = rivals_first.indices[:, :most]
+
+    # The same question, asked of [R, W] vehicles.
     few = Vehicles(*(field[rows].gather(1, columns) for field in vehicles))
-    some = idm.of(rows, columns) if isinstance(idm, DriverIdm) else idm
+    their_idm = idm.of(rows, columns) if isinstance(idm, DriverIdm) else idm
     wishes = wish[rows]
     asked = wishes.gather(1, columns)
-    granted = torch.where(_gives_way(few, scene.road, asked, some, mobil), 0, asked)
+    gives_way = _gives_way(few, scene.road, asked, their_idm, mobil)
+    granted = torch.where(gives_way, 0, asked)
+
+    # Back into their columns, and these rows among all.
     return wish.index_copy(0, rows, wishes.scatter(1, columns, granted))
 
 
@@ -148,11 +164,14 @@ def _gives_way(
     """Whether a vehicle ahead that wants the same lane is too close, bool [N, M]."""
     # Two that want the same lane from its two sides do not see each other in it yet.
     pairs = compare(vehicles, road)
+
+    # [N, i, j]: i and j want the same lane.
     wants = wish != 0
     target = vehicles.target_lane + wish
-    # [N, i, j]: i and j want the same lane, and j is ahead.
     both = wants[:, None, :] & wants[:, :, None]
     same = both & (target[:, None, :] == target[:, :, None])
+
+    # What i would do behind j, and whether j is too close ahead.
     speed = vehicles.speed[:, :, None]
     desired = vehicles.desired_speed[:, :, None]
     leader_speed = vehicles.speed[:, None, :]
@@ -190,20 +209,25 @@ def letting_past(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameter
     Args:
         ways: of the observers.
     """
+    # The follower in that lane, [N, K, 1].
     gap, index = nearest(scene, _wanted_lane(scene, ways), -1)
     behind = Vehicles(*(field.gather(1, index[..., 0])[..., None] for field in scene.vehicles))
+
+    # How it would have to brake after the change.
     speed = scene.observers.speed[..., None]
     demand = idm_acceleration(behind.speed, behind.desired_speed, gap, speed, idm.per_lane())
-    goes_on = (behind.speed > 0.0) & (behind.acceleration > -0.5 * mobil.courtesy)
-    # In a second.
-    goes_on = goes_on & (behind.speed - speed < mobil.courtesy)
     unsafe = (gap < FREE_GAP_M) & (demand < -mobil.safe_deceleration)
+
+    goes_on = (behind.speed > 0.0) & (behind.acceleration > -0.5 * mobil.courtesy)
+    # Braking for a second changes the speed by as much as ``courtesy`` says.
+    goes_on = goes_on & (behind.speed - speed < mobil.courtesy)
     return _courteous(scene, ways, unsafe & goes_on, mobil)
 
 
 def _wanted_lane(scene: Scene, ways: WaysOut) -> Tensor:
     """The lane that each observer has to reach, float [N, K, 1]."""
-    return (scene.observers.target_lane + ways.side).to(scene.observers.x.dtype)[..., None]
+    lane = scene.observers.target_lane + ways.side
+    return lane.to(scene.observers.x.dtype)[..., None]
 
 
 def _courteous(scene: Scene, ways: WaysOut, hindered: Tensor, mobil: MobilParameters) -> Tensor:
@@ -226,21 +250,26 @@ def yielding(scene: Scene, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
     asks = vehicles.valid & ways.asks
     if mobil.courtesy == 0.0 or (reads_are_cheap(asks) and not bool(asks.any())):
         return torch.full_like(vehicles.x, torch.inf)
+
+    # [N, i, j]: j is ahead of i, and asks for the lane that i keeps.
     pairs = scene.pairs
     wanted = vehicles.target_lane + ways.side
     into_its_lane = wanted[:, None, :] == vehicles.target_lane[:, :, None]
     ahead = asks[:, None, :] & into_its_lane & (pairs.order > 0)
+
+    # The nearest of them, [N, M, 1]; of two at the same gap the slower one counts.
     gaps = torch.where(ahead, pairs.gap, torch.inf)
     gap = gaps.amin(-1, keepdim=True)
-    # Of two at the same gap the slower one counts.
-    slowest = torch.where(ahead & (gaps == gap), vehicles.speed[:, None, :], torch.inf)
+    speeds = torch.where(ahead & (gaps == gap), vehicles.speed[:, None, :], torch.inf)
+    slowest = speeds.amin(-1, keepdim=True)
+
+    # IDM needs finite numbers where there is none, or where one is too near to change.
     exists = torch.isfinite(gap) & (gap > 0.5 * idm.min_gap_m)
-    leader_speed = torch.where(exists, slowest.amin(-1, keepdim=True), 0.0)
     acceleration = idm_acceleration(
         vehicles.speed[..., None],
         vehicles.desired_speed[..., None],
         torch.where(exists, gap, FREE_GAP_M).clamp_max(FREE_GAP_M),
-        leader_speed,
+        torch.where(exists, slowest, 0.0),
         idm.per_lane(),
     )
     makes_room = torch.where(exists, acceleration, torch.inf).clamp_min(-mobil.courtesy)[..., 0]
@@ -261,11 +290,14 @@ def mobil_wishes(
     """
     vehicles = scene.observers
     lane = vehicles.target_lane.to(vehicles.x.dtype)[..., None]
-    # Own lane first, then left and right; all three in one search.
+
+    # Own lane first, then left and right, [N, K, 3]; all three in one search.
     lanes = lane + constant((0.0, 1.0, -1.0), lane)
     accelerations = lane_accelerations(scene, lanes, idm)
     here = accelerations.of(slice(0, 1))
     there = accelerations.of(slice(1, None))
+
+    # Of the two changes, [N, K, 2].
     incentive, safe = mobil_criterion(there, here, mobil, politeness)
     possible = may_change(scene.road, lane, lanes[..., 1:] - lane, vehicles.x[..., None])
     if scene.road.has_lane_ends:
@@ -274,11 +306,12 @@ def mobil_wishes(
         incentive = incentive + torch.where(its > beside, its, 0.0)
         possible = possible & (its >= beside)
     pays = possible & safe & (incentive > mobil.threshold)
+
     left, right = torch.where(pays, incentive, -torch.inf).unbind(-1)
+    side = torch.where(left >= right, 1, -1)
     # A driver decides anew only when its last change is complete.
     free = lane_change_done(vehicles, scene.road) & vehicles.valid
-    wish = torch.where(left >= right, 1, -1)
-    return torch.where(free & torch.isfinite(torch.maximum(left, right)), wish, 0)
+    return torch.where(free & torch.isfinite(torch.maximum(left, right)), side, 0)
 
 
 def mobil_changes(
@@ -287,9 +320,10 @@ def mobil_changes(
     mobil: MobilParameters = TABLE_IV,
     politeness: Tensor | float = 1.0,
 ) -> Tensor:
-    """Lane change that each driver starts: :func:`mobil_wishes` filtered by :func:`one_at_a_time`.
+    """Lane change that each driver starts, -1, 0 or +1, int64 [N, M].
 
-    The ego (vehicle 0) is controlled by the agent: its column is 0, and it blocks no other change.
+    :func:`mobil_wishes` filtered by :func:`one_at_a_time`. The ego (vehicle 0) is controlled by the
+    agent: its column is 0, and it blocks no other change.
     """
     wish = without_ego(mobil_wishes(scene, idm, mobil, politeness))
     return one_at_a_time(scene, wish, idm, mobil)

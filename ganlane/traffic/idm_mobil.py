@@ -61,13 +61,15 @@ class IdmTraffic(TrafficModule):
         # Not isinstance: a subclass may override any part of a step.
         if type(self) not in (IdmTraffic, IdmMobilTraffic, IdmRandomTraffic):
             return None
-        rules = (self.idm, self.steering, self.mobil)
-        return RuleDrivers(*rules, random=self.drivers, stream=self.stream)
+        return RuleDrivers(
+            self.idm, self.steering, self.mobil, random=self.drivers, stream=self.stream
+        )
 
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Decide, accelerate, steer, advance."""
         scene = perceive(vehicles, self.road)
-        return self.drive(scene, self.targets(scene, memory, step), memory, step)
+        target = self.targets(scene, memory, step)
+        return self.drive(scene, target, memory, step)
 
     def targets(self, scene: Scene, memory: Memory, step: Tensor) -> Tensor:
         """The lane that each driver keeps or changes to, [N, M] int64."""
@@ -75,17 +77,24 @@ class IdmTraffic(TrafficModule):
 
     def drive(self, scene: Scene, target: Tensor, memory: Memory, step: Tensor) -> Moved:
         """The vehicles at t + 0.1 s, steered to the lanes ``target`` [N, M] int64."""
+        acceleration = self.following(scene, self.idm)
         centre = self.road.centre_of(target, scene.vehicles.y.dtype)
-        return self.advanced(scene, self.following(scene, self.idm), target, centre, memory)
+        return self.advanced(scene, acceleration, target, centre, memory)
 
     def following(self, scene: Scene, idm: AnyIdm) -> Tensor:
-        """Accelerations [N, M], m/s2."""
+        """Accelerations behind the vehicles ahead, m/s2, [N, M]."""
         return following_acceleration(scene, idm)
 
     def advanced(
         self, scene: Scene, acceleration: Tensor, target: Tensor, line: Tensor, memory: Memory
     ) -> Moved:
-        """Steered to the lines at ``line`` (m, [N, M])."""
+        """The vehicles at t + 0.1 s.
+
+        Args:
+            acceleration: that is driven, m/s2, [N, M].
+            target: lanes that others may see the change to, [N, M] int64.
+            line: lateral positions that the drivers steer to, m, [N, M].
+        """
         moved, steering = drive(
             scene.vehicles, acceleration, memory["steering"], line, self.dt, self.steering
         )
@@ -117,7 +126,8 @@ class IdmMobilTraffic(IdmTraffic):
         # On a GPU it would stall the queue.
         if reads_are_cheap(due) and not bool(due.any()):
             return lane
-        return lane + torch.where(due[:, None], self.changes(scene, memory), 0)
+        changes = self.changes(scene, memory)
+        return lane + torch.where(due[:, None], changes, 0)
 
     def following(self, scene: Scene, idm: AnyIdm) -> Tensor:
         """As IDM; where lanes end, drivers make room for those who have to leave theirs."""
@@ -161,8 +171,13 @@ class DriverParams(NamedTuple):
         No driver brakes harder than ``braking`` (m/s2, [N, M]).
         """
         # IDM's bound is an acceleration, so braking changes its sign.
-        driver = (self.headway, self.comfortable_deceleration, -braking, self.max_acceleration)
-        return DriverIdm(min_gap_m, *driver)
+        return DriverIdm(
+            min_gap_m,
+            self.headway,
+            self.comfortable_deceleration,
+            -braking,
+            self.max_acceleration,
+        )
 
     def sway_m(self, time_s: Tensor) -> Tensor:
         """How far each driver aims to the left of its lane's centre at ``time_s`` [N, 1], m."""
@@ -182,18 +197,25 @@ def start_braking(
     """
     scene = perceive(vehicles, road)
     pairs = scene.pairs
+
+    # [N, i, j]: j is ahead of i in a lane that i attends to. Everybody ahead counts, not only the
+    # leader, who may not brake in time itself.
     shares = in_lane(scene, scene.attention.low) | in_lane(scene, scene.attention.high)
-    # Everybody ahead counts, not only the leader, who may not brake in time itself.
     ahead = shares & (pairs.order > 0)
-    # Rank of each vehicle ahead: so many bodies and gaps have to fit between.
+
+    # Rank of each vehicle ahead (an argsort of an argsort): so many bodies and gaps have to fit
+    # between.
     distance = torch.where(ahead, pairs.distance, torch.inf)
     between = distance.argsort(-1).argsort(-1).to(vehicles.x.dtype)
     space = vehicles.length.amax(-1)[:, None, None] + min_gap_m
+
+    # What is left of the gap once the driver reacts.
     speed = vehicles.speed[:, :, None]
     leader_speed = vehicles.speed[:, None, :]
-    # What is left of the gap once the driver reacts.
     closing = (speed - leader_speed).clamp_min(0.0)
     gap = pairs.ahead - between * space - closing * reaction_s[..., None]
+
+    # Where nothing is left, a gap of 1 m stands in, which keeps the deceleration finite.
     needed = needed_deceleration(speed, leader_speed, gap.clamp_min(1.0))
     return torch.where(ahead, needed, 0.0).amax(-1)
 
@@ -229,42 +251,59 @@ class IdmRandomTraffic(IdmMobilTraffic):
         self.drivers = drivers or RandomDrivers()
         # The queue is as long as the slowest driver's reaction.
         self.delay_steps = round(self.drivers.reaction_s[1] / self.dt)
-        fields = {"steering": (), _PARAMETERS: (len(DriverParams._fields),)}
+        fields = {"steering": ((), None), _PARAMETERS: ((len(DriverParams._fields),), None)}
         if self.delay_steps:
-            fields["past"] = (self.delay_steps,)
-        self.memory_fields = {name: (shape, None) for name, shape in fields.items()}
+            fields["past"] = ((self.delay_steps,), None)
+        self.memory_fields = fields
 
     def driver_params(self, vehicles: Vehicles, key: Tensor) -> DriverParams:
         """The drivers at the start of the episodes with ``key`` [N]."""
-        d = self.drivers
-        # Each column has a fixed use: another order would change every episode.
+        drivers = self.drivers
+        # Each number has a fixed use: another order would change every episode.
         # Step -1 is no step of an episode, so nothing else draws these numbers.
-        u = uniforms(vehicles, key, -1, *_DRAWS)
+        (
+            u_headway,
+            u_acceleration,
+            u_deceleration,
+            u_braking,
+            u_politeness,
+            u_reaction,
+            u_sway,
+            u_period_one,
+            u_period_two,
+            u_phase_one,
+            u_phase_two,
+        ) = uniforms(vehicles, key, -1, *_DRAWS)
+
         # The scene may ask more of a driver than its range has: it then brakes as hard as that.
-        reaction_s = in_range(u[5], d.reaction_s)
+        reaction_s = in_range(u_reaction, drivers.reaction_s)
         required = start_braking(vehicles, self.road, reaction_s, self.idm.min_gap_m)
-        braking = torch.maximum(in_range(u[3], d.strongest_braking), _START_MARGIN * required)
+        braking = in_range(u_braking, drivers.strongest_braking)
+
         # Even at its largest sway a body stays within its lane.
         room = 0.5 * (self.road.lane_width_m - vehicles.width) - _LANE_MARGIN_M
+        sway = in_range(u_sway, drivers.sway_m)
+
         return DriverParams(
-            headway=in_range(u[0], d.headway_s),
-            max_acceleration=in_range(u[1], d.max_acceleration),
-            comfortable_deceleration=in_range(u[2], d.comfortable_deceleration),
-            strongest_braking=braking,
-            politeness=in_range(u[4], d.politeness),
+            headway=in_range(u_headway, drivers.headway_s),
+            max_acceleration=in_range(u_acceleration, drivers.max_acceleration),
+            comfortable_deceleration=in_range(u_deceleration, drivers.comfortable_deceleration),
+            strongest_braking=torch.maximum(braking, _START_MARGIN * required),
+            politeness=in_range(u_politeness, drivers.politeness),
             delay=torch.round(reaction_s / self.dt),
-            sway=torch.minimum(in_range(u[6], d.sway_m), room.clamp_min(0.0)),
-            frequency_one=2.0 * math.pi / in_range(u[7], d.sway_period_s),
-            frequency_two=2.0 * math.pi / in_range(u[8], d.sway_period_s),
-            phase_one=2.0 * math.pi * u[9],
-            phase_two=2.0 * math.pi * u[10],
+            sway=torch.minimum(sway, room.clamp_min(0.0)),
+            frequency_one=2.0 * math.pi / in_range(u_period_one, drivers.sway_period_s),
+            frequency_two=2.0 * math.pi / in_range(u_period_two, drivers.sway_period_s),
+            phase_one=2.0 * math.pi * u_phase_one,
+            phase_two=2.0 * math.pi * u_phase_two,
         )
 
     def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """Gives every driver but the ego its own desired speed."""
         (u,) = uniforms(vehicles, absorb(key, 0), -1, _DESIRED_SPEED)
+        factor = in_range(u, self.drivers.desired_speed)
+        desired = factor * vehicles.desired_speed
         # The ego's is the environment's.
-        desired = in_range(u, self.drivers.desired_speed) * vehicles.desired_speed
         desired[:, EGO_INDEX] = vehicles.desired_speed[:, EGO_INDEX]
         return super().enter(vehicles.with_(desired_speed=desired), key, episode)
 
@@ -283,7 +322,8 @@ class IdmRandomTraffic(IdmMobilTraffic):
         braking = torch.full_like(drivers.headway, -self.idm.min_acceleration)
         idm = drivers.idm(self.idm.min_gap_m, braking)
         # [N, M, 1]: one weight for both sides that a driver looks at.
-        return mobil_changes(scene, idm, self.mobil, drivers.politeness[..., None])
+        politeness = drivers.politeness[..., None]
+        return mobil_changes(scene, idm, self.mobil, politeness)
 
     def drive(self, scene: Scene, target: Tensor, memory: Memory, step: Tensor) -> Moved:
         """The vehicles at t + 0.1 s, with each driver's delay and sway."""
@@ -291,14 +331,19 @@ class IdmRandomTraffic(IdmMobilTraffic):
         idm = drivers.idm(self.idm.min_gap_m, drivers.strongest_braking)
         acceleration = self.following(scene, idm)
         new_memory = {_PARAMETERS: memory[_PARAMETERS]}
+
         if self.delay_steps:
-            # What was decided ``delay`` steps ago is driven now.
-            # The last entry is the present decision, which a delay of 0 takes.
+            # What was decided ``delay`` steps ago is driven now. Of the D + 1 decisions in
+            # ``recent`` the last is the present one, which a delay of 0 takes.
             recent = torch.cat((memory["past"], acceleration[..., None]), dim=-1)
             index = self.delay_steps - drivers.delay.long()
             acceleration = recent.gather(-1, index[..., None])[..., 0]
             new_memory["past"] = recent[..., 1:].contiguous()
+
+        # Drivers aim beside the centres of their lanes, m.
         time_s = (step.to(drivers.sway.dtype) * self.dt)[:, None]
-        line = self.road.centre_of(target, scene.vehicles.y.dtype) + drivers.sway_m(time_s)
+        centre = self.road.centre_of(target, scene.vehicles.y.dtype)
+        line = centre + drivers.sway_m(time_s)
+
         moved, steering = self.advanced(scene, acceleration, target, line, memory)
         return moved, {**steering, **new_memory}

@@ -47,7 +47,9 @@ POST_EVERY_M = 50.0
 def speed_tint(speed_mps: float) -> str:
     """Blue of a vehicle at this speed: dark at 0, pale at :data:`FAST_MPS` and above."""
     share = min(max(speed_mps / FAST_MPS, 0.0), 1.0)
+    # In levels, from 0 to 2, the place of the last blue.
     place = 2.0 * round(share * _LEVELS) / _LEVELS
+    # Red, green and blue, between the blues on both sides.
     channels = [np.interp(place, (0.0, 1.0, 2.0), channel) for channel in zip(*_BLUES)]
     return f"#{bytes(map(round, channels)).hex()}"
 
@@ -105,14 +107,22 @@ class Window:
     """
 
     def __init__(self, look: FilmConfig, lanes: int, lane_width_m: float) -> None:
-        self.width, self.height, self.length_m = look.width, look.height, look.road_m
-        self.lanes, self.lane_width_m = lanes, lane_width_m
+        self.width = look.width
+        self.height = look.height
+        self.length_m = look.road_m
+        self.lanes = lanes
+        self.lane_width_m = lane_width_m
+
+        # Rows between header and footer, and the one in their middle.
         room = look.height - HEADER_HEIGHT - FOOTER_HEIGHT
         self._middle = HEADER_HEIGHT + room / 2
+
         self.along = look.width / look.road_m
         # The road may not be higher than what header and footer leave, with 1 m of verge at each
         # side.
         self.across = min(self.along * EXAGGERATION, room / (lanes * lane_width_m + 2.0))
+
+        # The centre of lane 0, the rightmost, is at y = 0.
         upper, lower = self.row([(lanes - 0.5) * lane_width_m, -0.5 * lane_width_m])
         self.edges = float(upper), float(lower)
 
@@ -144,34 +154,44 @@ class Backdrop:
         size = (window.width + self.period, window.height)
         self.strip = strip = Image.new("RGB", size, VERGE)
         draw = ImageDraw.Draw(strip)
+
+        # Columns where periods of lane marks begin.
         half = self.period / 2
-        upper, lower = window.edges
         starts = np.arange(0, strip.width, half)
         # Every second period's verge is a shade lighter, so that movement shows.
         for start in starts[::2]:
             draw.rectangle((start, 0, start + half - 1, strip.height), fill=VERGE_STRIPE)
+
+        # Asphalt, a little beyond the edge lines.
+        upper, lower = window.edges
         draw.rectangle((0, upper - 5, strip.width, lower + 5), fill=ASPHALT)
         for edge in window.edges:
             draw.line((0, edge, strip.width, edge), fill=MARK, width=3)
-        for mark in window.row((np.arange(window.lanes - 1) + 0.5) * window.lane_width_m):
+
+        # Dashes between the lanes.
+        borders_m = (np.arange(window.lanes - 1) + 0.5) * window.lane_width_m
+        for row in window.row(borders_m):
             for start in starts:
-                draw.line((start, mark, start + DASH_M * window.along, mark), fill=MARK, width=2)
+                draw.line((start, row, start + DASH_M * window.along, row), fill=MARK, width=2)
 
     def at(self, ego_x_m: float) -> Image.Image:
         """A fresh picture of the road around the ego.
 
         Posts tell the distance from the start, m.
         """
-        window, lower = self.window, self.window.edges[1]
+        window = self.window
+        # The strip repeats after a period, so the picture is cut out of it anywhere on the road.
         shift = round(-float(window.column(0.0, ego_x_m))) % self.period
         picture = self.strip.crop((shift, 0, shift + window.width, window.height))
         draw = ImageDraw.Draw(picture)
         for lane, stretch in enumerate(self.stretches):
             self._draw_ends(draw, lane, stretch, ego_x_m)
+
         # 10 m more at both ends, where a post's number may still reach into the picture.
         start = window.start(ego_x_m)
         first = np.ceil((start - 10.0) / POST_EVERY_M) * POST_EVERY_M
         posts = np.arange(first, start + window.length_m + 10.0, POST_EVERY_M)
+        _, lower = window.edges
         for metres, column in zip(posts, window.column(posts, ego_x_m)):
             draw.line((column, lower + 7, column, lower + 20), fill=FAINT, width=2)
             put_text(picture, (column + 7, lower + 8), f"{int(metres)} m")
@@ -180,24 +200,40 @@ class Backdrop:
     def _draw_ends(
         self, draw: ImageDraw.ImageDraw, lane: int, stretch: LaneStretch, ego_x_m: float
     ) -> None:
-        """No road before an exit lane and behind a wall, which is red; a kerb beside a ramp."""
+        """Where a lane begins and ends.
+
+        No road before an exit lane and behind a wall, which is red; a kerb beside a ramp.
+        """
         window = self.window
+        is_leftmost = lane == window.lanes - 1
         far_m = window.length_m * 2.0
         # Within the picture's surroundings, since pixels of a lane without an end would overflow.
         ends = np.clip([stretch.begin_m, stretch.end_m], ego_x_m - far_m, ego_x_m + far_m)
         begin, end = window.column(ends, ego_x_m).tolist()
+
+        # Rows of the lane's left and right side.
         sides = (np.array([0.5, -0.5]) + lane) * window.lane_width_m
         upper, lower = window.row(sides).tolist()
-        is_exit = stretch.end == EXIT
-        nothing = (0.0, begin) if is_exit else (end, float(window.width))
-        ramp = (end, float(window.width)) if is_exit else (0.0, begin)
         # The outermost lanes have an edge of asphalt.
-        top = upper - 6 if lane == window.lanes - 1 else upper + 2
+        top = upper - 6 if is_leftmost else upper + 2
         bottom = lower + 6 if lane == 0 else lower - 2
-        if nothing[0] < nothing[1]:
-            draw.rectangle((nothing[0], top, nothing[1], bottom), fill=VERGE)
+
+        # Columns before and behind the lane: there is no road at one, and a ramp at the other.
+        before = (0.0, begin)
+        behind = (end, float(window.width))
+        nothing, ramp = (before, behind) if stretch.end == EXIT else (behind, before)
+        left, right = nothing
+        if left < right:
+            draw.rectangle((left, top, right, bottom), fill=VERGE)
+        # A wall is 1 m thick.
         if stretch.end == WALL:
-            draw.rectangle((end, top, end + 1.0 * window.along, bottom), fill=CRASH)
-        kerbs = [upper] * (lane < window.lanes - 1) + [lower] * (lane > 0)
-        for kerb in kerbs if ramp[0] < ramp[1] else ():
-            draw.line((ramp[0], kerb, ramp[1], kerb), fill=VERGE, width=6)
+            draw.rectangle((end, top, end + window.along, bottom), fill=CRASH)
+
+        # Kerbs between the ramp and the lanes beside it.
+        left, right = ramp
+        if left >= right:
+            return
+        if not is_leftmost:
+            draw.line((left, upper, right, upper), fill=VERGE, width=6)
+        if lane > 0:
+            draw.line((left, lower, right, lower), fill=VERGE, width=6)

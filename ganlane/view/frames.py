@@ -87,105 +87,135 @@ class FramePainter:
 
     def draw(self, frame: int) -> Picture:
         """The picture of one frame, [height, width, 3]."""
-        t, width = self.trajectory, self.window.width
-        ego_x = float(t.x[frame, 0])
-        columns = self.window.column(t.x[frame], ego_x)
-        lengths = t.length[frame] * self.window.along
+        trajectory = self.trajectory
+        ego_x = float(trajectory.x[frame, 0])
         picture = self._backdrop.at(ego_x)
         self._draw_trails(picture, frame, ego_x)
-        in_picture = (columns > -lengths) & (columns < width + lengths) & t.valid[frame]
+
+        # Of all vehicles, [M], pixels.
+        columns = self.window.column(trajectory.x[frame], ego_x)
+        lengths = trajectory.length[frame] * self.window.along
+        in_picture = (columns > -lengths) & (columns < self.window.width + lengths)
+        shown = np.flatnonzero(in_picture & trajectory.valid[frame])
         # The ego comes last, on top of the others.
-        for vehicle in np.flatnonzero(in_picture)[::-1].tolist():
+        for vehicle in shown[::-1].tolist():
             self._draw_vehicle(picture, frame, vehicle, float(columns[vehicle]))
-        if frame == len(t) - 1:
+
+        if frame == len(trajectory) - 1:
             self._draw_outcome(picture, float(columns[0]))
         self._draw_header(picture, frame)
         return np.asarray(picture)
 
     def _draw_vehicle(self, picture: Image.Image, frame: int, vehicle: int, column: float) -> None:
         """A box to scale, its centre in this column, with its speed in m/s on the roof."""
-        t, at, window, is_ego = self.trajectory, (frame, vehicle), self.window, vehicle == 0
-        middle = np.array([column, float(window.row(t.y[at]))])
-        # Pixels (column, row) from end to end and from side to side.
-        cos, sin = np.cos(t.heading[at]), np.sin(t.heading[at])
-        # Rows of the picture count downwards, so what points to the left has a negative row.
-        forward = np.array([cos * window.along, -sin * window.across]) * t.length[at]
-        left = np.array([-sin * window.along, -cos * window.across]) * t.width[at]
-        # The vehicle is drawn on a patch around its middle.
+        trajectory = self.trajectory
+        window = self.window
+        at = (frame, vehicle)
+        middle = np.array([column, float(window.row(trajectory.y[at]))])
+
+        # Pixels (column, row) from end to end and from side to side. Rows of the picture count
+        # downwards, so what points to the left has a negative row.
+        cos = np.cos(trajectory.heading[at])
+        sin = np.sin(trajectory.heading[at])
+        forward = np.array([cos * window.along, -sin * window.across]) * trajectory.length[at]
+        left = np.array([-sin * window.along, -cos * window.across]) * trajectory.width[at]
+
+        # The vehicle is drawn on a patch around its middle, enlarged.
         reach = np.ceil((np.abs(forward) + np.abs(left)) / 2 + 3).astype(int)
         corner = np.floor(middle).astype(int) - reach
         centre = (middle - corner) * _BODY_OVERSAMPLING
         width, height = ((2 * reach + 1) * _BODY_OVERSAMPLING).tolist()
 
+        speed = float(trajectory.speed[at])
+        colour = canvas.EGO if vehicle == 0 else canvas.speed_tint(speed)
+        layers = self._layers(frame, vehicle, colour)
+        _, edge = layers[0]
+        # Transparent in the colour of the edge, so that no other colour shows through it.
+        patch = Image.new("RGBA", (width, height), f"{edge}00")
+        draw = ImageDraw.Draw(patch)
+        for outline, fill in layers:
+            along, across = outline[:, :1] * forward, outline[:, 1:] * left
+            points = centre + _BODY_OVERSAMPLING * (along + across)
+            draw.polygon(points.flatten().tolist(), fill=fill)
+        smooth = patch.reduce(_BODY_OVERSAMPLING)
+        picture.paste(smooth, tuple(corner.tolist()), smooth)
+
+        if self.look.speeds:
+            place = (column - 0.09 * forward[0], middle[1] - SMALL * 0.62)
+            put_text(picture, place, f"{speed:.0f}", canvas.readable_on(colour), anchor=0.5)
+
+    def _layers(self, frame: int, vehicle: int, colour: str) -> list[tuple[FloatArray, str]]:
+        """What a vehicle of this colour is drawn of, outlines and their colours, the lowest first.
+
+        Its edge, its body, and the lights that are on. Outlines [points, 2] are shares of length
+        and width.
+        """
+        trajectory = self.trajectory
+        at = (frame, vehicle)
+        is_ego = vehicle == 0
         overlaps = bool(self._overlapping[at])
-        colour = canvas.EGO if is_ego else canvas.speed_tint(float(t.speed[at]))
         edge = canvas.TEXT if is_ego else canvas.darker(colour)
         if overlaps:
             edge = canvas.CRASH
-        patch = Image.new("RGBA", (width, height), f"{edge}00")
-        draw = ImageDraw.Draw(patch)
+        outline = _EGO if is_ego else _BODY
+        # An edge that says something is broader.
+        inside = 0.86 if overlaps or is_ego else 0.93
+        layers = [(outline, edge), (outline * inside, colour)]
 
-        def fill(outline: FloatArray, colour: str) -> None:
-            """Fill an outline of shares of length and width."""
-            along, across = outline[:, :1] * forward, outline[:, 1:] * left
-            points = centre + _BODY_OVERSAMPLING * (along + across)
-            draw.polygon([(x, y) for x, y in points.tolist()], fill=colour)
+        if trajectory.acceleration[at] < _BRAKE_LIGHT:
+            layers += [(_BRAKE, canvas.BRAKE), (_BRAKE * _MIRROR, canvas.BRAKE)]
 
-        body = _EGO if is_ego else _BODY
-        fill(body, edge)
-        fill(body * (0.86 if overlaps or is_ego else 0.93), colour)
-        if t.acceleration[at] < _BRAKE_LIGHT:
-            fill(_BRAKE, canvas.BRAKE)
-            fill(_BRAKE * _MIRROR, canvas.BRAKE)
         # Positive: the target lane lies to the left.
-        offset = float(t.target_lane[at] * t.label.lane_width_m - t.y[at])
-        if abs(offset) > _SIGNAL_M and t.time_s[frame] % _BLINK_S < _LIT_S:
+        target_y = trajectory.target_lane[at] * trajectory.label.lane_width_m
+        offset = float(target_y - trajectory.y[at])
+        if abs(offset) > _SIGNAL_M and trajectory.time_s[frame] % _BLINK_S < _LIT_S:
             for light in _INDICATORS:
-                fill(light if offset > 0 else light * _MIRROR, canvas.AMBER)
-
-        smooth = patch.reduce(_BODY_OVERSAMPLING)
-        picture.paste(smooth, tuple(corner.tolist()), smooth)
-        if self.look.speeds:
-            place = (column - 0.09 * forward[0], middle[1] - SMALL * 0.62)
-            ink = canvas.readable_on(colour)
-            put_text(picture, place, f"{t.speed[at]:.0f}", ink, anchor=0.5)
+                layers.append((light if offset > 0 else light * _MIRROR, canvas.AMBER))
+        return layers
 
     def _draw_trails(self, picture: Image.Image, frame: int, ego_x: float) -> None:
         """Trails over the last seconds, as in the paper's Figure 3.
 
         The ego's is brighter.
         """
-        t = self.trajectory
+        trajectory = self.trajectory
         steps = round(self.look.trail_s / PHYSICS_STEP_S)
         past = slice(max(0, frame - steps), frame + 1)
         # What came before a jump belongs to another place.
         is_here = self._jumps[past] == self._jumps[frame]
-        shown = t.valid[past] & t.valid[frame] & is_here
+        shown = trajectory.valid[past] & trajectory.valid[frame] & is_here
+
         # The mask is as high as the road, which takes less time than the whole picture.
         upper, lower = self.window.edges
         top = int(upper) - 20
         height = int(lower) + 20 - top
         mask = Image.new("L", (picture.width * _TRAIL_OVERSAMPLING, height * _TRAIL_OVERSAMPLING))
-        columns, rows = self.window.column(t.x[past], ego_x), self.window.row(t.y[past]) - top
-        places = np.stack((columns, rows), axis=-1) * _TRAIL_OVERSAMPLING
         draw = ImageDraw.Draw(mask)
+
+        # [frames, M, 2]: column and row of every vehicle in the mask.
+        columns = self.window.column(trajectory.x[past], ego_x)
+        rows = self.window.row(trajectory.y[past]) - top
+        places = np.stack((columns, rows), axis=-1) * _TRAIL_OVERSAMPLING
         # The ego comes last, on top of the others.
-        for vehicle in reversed(range(t.x.shape[1])):
-            trail = [(x, y) for x, y in places[:, vehicle][shown[:, vehicle]].tolist()]
+        for vehicle in reversed(range(trajectory.x.shape[1])):
+            trail = places[:, vehicle][shown[:, vehicle]]
             coverage = _OTHER_COVERAGE if vehicle else _EGO_COVERAGE
-            draw.line(trail, fill=coverage, width=2 * _TRAIL_OVERSAMPLING)
+            draw.line(trail.flatten().tolist(), fill=coverage, width=2 * _TRAIL_OVERSAMPLING)
         picture.paste("white", (0, top), mask.reduce(_TRAIL_OVERSAMPLING))
 
     def _draw_header(self, picture: Image.Image, frame: int) -> None:
         """Put the header of one frame on the picture."""
-        t, action = self.trajectory, int(self.trajectory.action[frame])
+        trajectory = self.trajectory
+        action = int(trajectory.action[frame])
+        # In the order of _VALUES.
         values = (
-            f"{t.time_s[frame]:.1f} s",
-            f"{t.speed[frame, 0]:.1f} m/s",
-            f"{t.returns[frame]:.1f}",
+            f"{trajectory.time_s[frame]:.1f} s",
+            f"{trajectory.speed[frame, 0]:.1f} m/s",
+            f"{trajectory.returns[frame]:.1f}",
             # There is none before the first decision.
             "-" if action < 0 else NUMBERED[LANE_SPEED][action],
         )
+
         picture.paste(self._header, (0, 0))
         column = self._values_at
         for value, width in zip(values, _VALUES.values()):
@@ -199,10 +229,13 @@ class FramePainter:
         if outcome not in _OUTCOMES:
             return
         draw = ImageDraw.Draw(picture)
+
         if outcome == "hard_crash":
-            row, radius = float(self.window.row(self.trajectory.y[-1, 0])), 6.0 * self.window.along
+            row = float(self.window.row(self.trajectory.y[-1, 0]))
+            radius = 6.0 * self.window.along
             box = (ego_column - radius, row - radius, ego_column + radius, row + radius)
             draw.ellipse(box, outline=canvas.CRASH, width=3)
+
         text, colour = _OUTCOMES[outcome]
         width = canvas.text_mask(text, 24).width + 40
         left = (picture.width - width) // 2
@@ -216,12 +249,14 @@ def _header(label: EpisodeLabel, window: Window, values_at: int) -> Image.Image:
     picture = Image.new("RGB", (window.width, HEADER_HEIGHT), canvas.HEADER)
     title = f"{label.agent}  on  {label.traffic}"
     put_text(picture, (16, 8), title, canvas.TEXT, _TITLE)
+
     lanes = f"{label.lanes} lane{'s' if label.lanes > 1 else ''}"
     facts = f"episode {label.episode}, seed {label.seed}, {lanes}"
     factor = window.across / window.along
     if factor > 1.05:
         facts += f"; drawn {factor:.1f} times as wide as it is"
     put_text(picture, (16, 34), facts)
+
     for name, width in _VALUES.items():
         put_text(picture, (values_at, 9), name)
         values_at += width

@@ -239,7 +239,8 @@ def quietly(reader: Reader, path: Path, said: io.StringIO) -> Any:
 def bits(content: Any) -> bytes:
     """Contents with the same bits are the same; tensors count by their values."""
     if isinstance(content, dict):
-        return b"".join(str(key).encode() + bits(content[key]) for key in content)
+        # safetensors gives its tensors in an order of its own.
+        return b"".join(str(key).encode() + bits(content[key]) for key in sorted(content))
     if isinstance(content, list | tuple):
         return b"".join(map(bits, content))
     if isinstance(content, torch.Tensor | np.ndarray):

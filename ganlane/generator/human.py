@@ -70,6 +70,8 @@ LONGEST = 12.0
 LONG_AGO = 6.0
 #: Lanes around a driver, as indices of the last dimension of :class:`Near`.
 RIGHT, SAME, LEFT = range(3)
+#: Sides in the order of a lane choice, with the sign of what is directed to them.
+_SIDES = ((LEFT, 1.0), (RIGHT, -1.0))
 #: What the driver behind, and the driver itself, would have to brake, among the numbers of a side.
 REAR_BRAKING = 9
 FRONT_BRAKING = 10
@@ -335,15 +337,13 @@ def features_of(situation: Situation) -> Tensor:
     The weights know them by their order, as does the native kernel.
     """
     view = situation.view
-    ahead = _seen(view.ahead, view.speed)
-    behind = _seen(view.behind, view.speed)
     features = [
         *_own_state(situation),
         *_leader_of_leader(view.ahead),
         *view.exists.to(view.speed.dtype).unbind(-1),
         *_room(situation),
-        *ahead.flatten(-2).unbind(-1),
-        *behind.flatten(-2).unbind(-1),
+        *_seen(view.ahead, view.speed),
+        *_seen(view.behind, view.speed),
     ]
     return torch.stack(features, -1)
 
@@ -356,11 +356,11 @@ def _log_gap(gap: Tensor) -> Tensor:
 def _own_state(situation: Situation) -> list[Tensor]:
     """22 numbers of the driver itself and its place in the lane."""
     vehicles, memory, road, view = situation
-    speed, lane = view.speed, view.lane
+    speed = view.speed
     target = vehicles.target_lane.to(speed.dtype)
     # To the left of the lanes' centres, m.
     from_target = vehicles.y - road.centre_of(target)
-    from_centre = vehicles.y - road.centre_of(lane)
+    from_centre = vehicles.y - road.centre_of(view.lane)
     return [
         # Motion along the road.
         speed / 10.0,
@@ -372,7 +372,7 @@ def _own_state(situation: Situation) -> list[Tensor]:
         # Place and motion across the road; -1 and 1 are the edges of the lane.
         from_target.clamp(-4.0, 4.0),
         from_centre / road.lane_width_m * 2.0,
-        (target - lane).clamp(-1.0, 1.0),
+        (target - view.lane).clamp(-1.0, 1.0),
         view.aside * 2.0,
         *(memory.lateral_speeds * 2.0).unbind(-1),
         # Whether it is a lorry, what its memory is worth, and how it drives.
@@ -393,11 +393,7 @@ def _leader_of_leader(ahead: Near) -> list[Tensor]:
     exists = follows & follows.gather(1, leader)
     gap = torch.where(exists, ahead.gap[..., SAME].gather(1, leader), SIGHT_M)
     closing = torch.where(exists, ahead.closing[..., SAME].gather(1, leader), 0.0)
-    return [
-        _log_gap(gap),
-        torch.asinh(closing),
-        ahead.acceleration[..., SAME] / 1.5,
-    ]
+    return [_log_gap(gap), torch.asinh(closing), ahead.acceleration[..., SAME] / 1.5]
 
 
 def _room(situation: Situation) -> list[Tensor]:
@@ -407,7 +403,7 @@ def _room(situation: Situation) -> list[Tensor]:
 
     # Who is level with the driver, give or take 1 m; distances of the centres, m, 9 for nobody.
     numbers = []
-    for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
+    for side, sign in _SIDES:
         nearest_aside = torch.full_like(width, 9.0)
         alongside = torch.zeros_like(vehicles.valid)
         for near in (ahead, view.behind):
@@ -431,8 +427,8 @@ def _room(situation: Situation) -> list[Tensor]:
     ]
 
 
-def _seen(near: Near, speed: Tensor) -> Tensor:
-    """5 numbers of each of three neighbours, [N, M, 5, 3]."""
+def _seen(near: Near, speed: Tensor) -> tuple[Tensor, ...]:
+    """15 numbers [N, M]: five kinds, each of the three neighbours in :class:`Near`'s order."""
     exists = near.exists.to(speed.dtype)
     # Nobody is as far away as can be seen: 2.7 is the logarithm of 150 m in units of 10 m.
     distance = exists * _log_gap(near.gap) + (1.0 - exists) * 2.7
@@ -440,7 +436,8 @@ def _seen(near: Near, speed: Tensor) -> Tensor:
     time_s = (near.gap / pace).clamp(-1.0, 5.0) * 0.5
     # The reciprocal of the time to collision, 1/s.
     approach = (-near.closing / near.gap.clamp_min(2.0)).clamp(-1.0, 1.0) * 3.0
-    return torch.stack((distance, time_s, torch.asinh(near.closing), approach, exists), -2)
+    numbers = torch.stack((distance, time_s, torch.asinh(near.closing), approach, exists), -2)
+    return numbers.flatten(-2).unbind(-1)
 
 
 def _sides_of(situation: Situation) -> Tensor:
@@ -461,7 +458,7 @@ def _sides_of(situation: Situation) -> Tensor:
     since = memory.since.clamp_max(LONGEST) / LONGEST
 
     sides = []
-    for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
+    for side, sign in _SIDES:
         front, rear = ahead.gap[..., side], behind.gap[..., side]
         rear_closing = behind.closing[..., side]
         there = gain[..., side]
@@ -681,8 +678,14 @@ def remembered(situation: Situation, acceleration: Tensor) -> Memory:
     accelerations = torch.cat((acceleration[..., None], memory.accelerations[..., :-1]), -1)
     lateral_speeds = torch.stack((view.aside, memory.lateral_speeds[..., 0]), -1)
     closing = torch.stack((view.closing, memory.closing[..., 0]), -1)
-    age, since = memory.age + 1.0, memory.since + 1.0
-    return Memory(accelerations, lateral_speeds, closing, memory.style, age, since)
+    return Memory(
+        accelerations,
+        lateral_speeds,
+        closing,
+        memory.style,
+        memory.age + 1.0,
+        memory.since + 1.0,
+    )
 
 
 def moved(vehicles: Vehicles, acceleration: Tensor, aside: Tensor) -> Vehicles:

@@ -5,6 +5,18 @@ a change of its acceleration and of its lateral speed from distributions over to
 (headway, restlessness, pace) is what its own history shows, so that drivers differ as recorded ones
 do. There is no anchor, guard or clock. All inputs are relative: gaps, times, speed differences.
 
+One decision, as in :meth:`ganlane.traffic.human.HumanTraffic.decide`::
+
+    situation = situation_of(vehicles, memory, road)        # what drivers perceive and remember
+    chances = policy.lane_chances(lane_choice(situation))   # whether to change lanes
+    situation = with_choice(situation, chosen(chances, u))
+    along, across = policy(features_of(situation))          # how to move: logits of tokens
+    change = ALONG.sample(along, u_along)
+    aside = ACROSS.sample(across, u_across)
+    acceleration, lateral_speed = bounded(situation, change, aside)
+    memory = remembered(situation, acceleration)
+
+Shapes: N rows (environments, scenes or segments) of M vehicles. Left is positive across the road.
 The same functions serve the fit (:mod:`ganlane.generator.human_fit`), its fine-tuning
 (:mod:`ganlane.generator.human_tuning`) and the traffic (:mod:`ganlane.traffic.human`).
 """
@@ -28,7 +40,7 @@ from ganlane.settings.generator import (
     SIDE_FEATURES,
     HumanSizes,
 )
-from ganlane.sim.neighbours import nearest
+from ganlane.sim.neighbours import Scene, nearest
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.state import LaneRange, Road, Vehicles
 
@@ -56,8 +68,13 @@ ANTICIPATION_S = 1.0
 LONGEST = 12.0
 #: Decisions since the last lane change of a driver whose last one was not recorded.
 LONG_AGO = 6.0
-#: What the driver behind would have to brake, among the numbers of a side.
+#: Lanes around a driver, as indices of the last dimension of :class:`Near`.
+RIGHT, SAME, LEFT = range(3)
+#: Sides in the order of a lane choice, with the sign of what is directed to them.
+_SIDES = ((LEFT, 1.0), (RIGHT, -1.0))
+#: What the driver behind, and the driver itself, would have to brake, among the numbers of a side.
 REAR_BRAKING = 9
+FRONT_BRAKING = 10
 #: Standard deviation of the soft targets, in tokens.
 BLUR = 0.7
 #: The probabilities of both lane changes together are at most this.
@@ -89,27 +106,37 @@ class Tokens(NamedTuple):
         return self.scale * torch.sinh((index / (self.number - 1) * 2.0 - 1.0) * self.reach)
 
     def soft_target(self, value: Tensor) -> Tensor:
-        """A distribution over the tokens around ``value``, [..., number]."""
+        """A distribution over the tokens around ``value`` [...], as probabilities [..., number]:
+        a discrete Gaussian of :data:`BLUR` tokens.
+        """
+        # The value's real-valued index, from 0 to number - 1.
         place = torch.asinh(value / self.scale).clamp(-self.reach, self.reach)
         index = (place / self.reach + 1.0) * 0.5 * (self.number - 1)
+
+        # Distances of all tokens from it, in standard deviations.
         numbers = torch.arange(self.number, device=value.device).to(value.dtype)
         distance = (numbers - index[..., None]) / BLUR
         return torch.softmax(-0.5 * distance * distance, -1)
 
     def sample(self, logits: Tensor, u: Tensor, temperature: float = 1.0) -> Tensor:
-        """A value from uniform numbers ``u`` [...]: the inverse of the distribution function,
-        linear within a token.
+        """Values [...] from uniform numbers ``u`` [...] and ``logits`` [..., number]: the inverse
+        of the distribution function, linear within a token.
         """
         chance = torch.softmax(logits / temperature, -1)
+        # The distribution function at the upper end of every token.
         upper = chance.cumsum(-1)
-        token = (upper < u[..., None]).sum(-1).clamp_max(self.number - 1)
-        its_chance = chance.gather(-1, token[..., None])[..., 0].clamp_min(1e-9)
-        its_upper = upper.gather(-1, token[..., None])[..., 0]
-        within = ((u - (its_upper - its_chance)) / its_chance).clamp(0.0, 1.0) - 0.5
-        return self.value(token + within)
+
+        # The token in which u lies; rounding may leave the last upper end below 1.
+        token = (upper < u[..., None]).sum(-1, keepdim=True).clamp_max(self.number - 1)
+        token_chance = chance.gather(-1, token)[..., 0].clamp_min(1e-9)
+        token_lower = upper.gather(-1, token)[..., 0] - token_chance
+
+        # Where in the token, from -0.5 to 0.5.
+        within = ((u - token_lower) / token_chance).clamp(0.0, 1.0) - 0.5
+        return self.value(token[..., 0] + within)
 
     def mean(self, logits: Tensor) -> Tensor:
-        """The expected value [...]."""
+        """The expected value [...] of ``logits`` [..., number]."""
         return torch.softmax(logits, -1) @ self.centres(logits)
 
 
@@ -141,15 +168,10 @@ class Memory(NamedTuple):
 
 def memory_of(accelerations: Tensor, lateral_speeds: Tensor, age: Tensor) -> Memory:
     """A memory [N, M] without style and closing speeds; the last lane change is long ago."""
-    zero = torch.zeros_like(age)
-    return Memory(
-        accelerations,
-        lateral_speeds,
-        torch.stack((zero, zero), -1),
-        torch.stack((zero, zero, zero), -1),
-        age,
-        zero + LONG_AGO,
-    )
+    closing = age.new_zeros(*age.shape, HUMAN_MEMORY["closing"])
+    style = age.new_zeros(*age.shape, HUMAN_MEMORY["style"])
+    since = torch.full_like(age, LONG_AGO)
+    return Memory(accelerations, lateral_speeds, closing, style, age, since)
 
 
 class View(NamedTuple):
@@ -159,9 +181,9 @@ class View(NamedTuple):
         speed, aside: their own along and across the road, m/s, [N, M].
         lane: whose centre is nearest, [N, M], float.
         exists: whether there is a lane to the left, to the right, [N, M, 2].
-        ahead, behind: the nearest in three lanes.
-        log_headway: of drivers who follow, NaN for others.
-        relative_speed: over the mean of the neighbours, m/s.
+        ahead, behind: the nearest in three lanes, [N, M, 3].
+        log_headway: logarithm of the headway in s of drivers who follow, NaN for others, [N, M].
+        relative_speed: over the mean of the neighbours, m/s, [N, M].
     """
 
     speed: Tensor
@@ -175,20 +197,28 @@ class View(NamedTuple):
 
     @property
     def gap(self) -> Tensor:
-        """To the leader in the own lane, m."""
-        return self.ahead.gap[..., 1]
+        """To the leader in the own lane, m, [N, M]."""
+        return self.ahead.gap[..., SAME]
 
     @property
     def closing(self) -> Tensor:
-        """Speed of the leader less the own one, m/s."""
-        return self.ahead.closing[..., 1]
+        """Speed of the leader less the own one, m/s, [N, M]."""
+        return self.ahead.closing[..., SAME]
 
 
 class Near(NamedTuple):
     """The nearest vehicles in the lanes to the right, the own one, to the left, [N, M, 3].
 
-    Gap in m, speed less the own one in m/s, acceleration, place to the left in m, lateral speed,
-    whether there is one, and which one. Where nobody is, the gap is :data:`SIGHT_M` and the rest 0.
+    Where nobody is, the gap is :data:`SIGHT_M` and the rest 0.
+
+    Attributes:
+        gap: between the bumpers, m; below 0 for who is alongside.
+        closing: its speed less the own one, m/s.
+        acceleration: its own, m/s2.
+        aside: how far to the left of the driver it is, m.
+        lateral_speed: its own, m/s.
+        exists: whether there is one.
+        which: its index among the M vehicles.
     """
 
     gap: Tensor
@@ -201,9 +231,10 @@ class Near(NamedTuple):
 
 
 def velocity(vehicles: Vehicles) -> tuple[Tensor, Tensor]:
-    """Speeds along and across the road, m/s."""
+    """Speeds along and across the road, m/s, [N, M]."""
     along = vehicles.speed * torch.cos(vehicles.heading)
-    return along, vehicles.speed * torch.sin(vehicles.heading)
+    across = vehicles.speed * torch.sin(vehicles.heading)
+    return along, across
 
 
 def lane_after(y: Tensor, aside: Tensor, road: Road, seconds: float) -> Tensor:
@@ -215,60 +246,69 @@ def lane_after(y: Tensor, aside: Tensor, road: Road, seconds: float) -> Tensor:
 
 
 def perceive(vehicles: Vehicles, road: Road, sides: bool = True) -> View:
-    """What every driver perceives.
+    """What every driver perceives now.
 
-    Without ``sides`` a driver sees its own lane alone, as where only one lane was recorded.
+    Args:
+        vehicles: fields [N, M]; nobody sees those that are not valid.
+        road: that they are on.
+        sides: without them a driver sees its own lane alone, as where only one lane was recorded.
     """
     speed, aside = velocity(vehicles)
     lane = road.lane_of(vehicles.y)
-    soon = lane_after(vehicles.y, aside, road, ANTICIPATION_S)
+
     # Who changes lanes is in both; absent vehicles are in none.
+    soon = lane_after(vehicles.y, aside, road, ANTICIPATION_S)
     nowhere = torch.where(vehicles.valid, 0.0, torch.inf)
     presence = LaneRange(torch.minimum(lane, soon) + nowhere, torch.maximum(lane, soon))
     scene = scene_of(vehicles, road)._replace(presence=presence)
+
     lanes = torch.stack((lane - 1, lane, lane + 1), -1)
+    exists = torch.stack((lane + 1 < road.lanes, lane > 0), -1) & sides
+    ahead = _nearest_on(1, scene, lanes, speed, aside, sides)
+    behind = _nearest_on(-1, scene, lanes, speed, aside, sides)
 
-    def nearest_on(side: int) -> Near:
-        gap, index = nearest(scene, lanes, side)
-        exists = gap < SIGHT_M
-        if not sides:
-            exists = exists & torch.tensor([False, True, False], device=gap.device)
-        # Nobody's index may be beyond the last vehicle.
-        index = torch.where(exists, index, 0)
-        flat = index.flatten(1)
-
-        def of(number: Tensor) -> Tensor:
-            return number.gather(1, flat).view(gap.shape)
-
-        def where_seen(number: Tensor) -> Tensor:
-            return torch.where(exists, number, 0.0)
-
-        return Near(
-            torch.where(exists, gap, SIGHT_M),
-            where_seen(of(speed) - speed[..., None]),
-            where_seen(of(vehicles.acceleration)),
-            where_seen(of(vehicles.y) - vehicles.y[..., None]),
-            where_seen(of(aside)),
-            exists,
-            index,
-        )
-
-    ahead, behind = nearest_on(1), nearest_on(-1)
-    gap = ahead.gap[..., 1]
     # Followers within 80 m show their headway.
-    follows = ahead.exists[..., 1] & (gap < 80.0)
+    gap = ahead.gap[..., SAME]
+    follows = ahead.exists[..., SAME] & (gap < 80.0)
     headway = (gap.clamp_min(0.5) / speed.clamp_min(2.0)).clamp(0.2, 6.0)
+    log_headway = torch.where(follows, torch.log(headway), torch.nan)
+
+    # Over the up to six neighbours, [N, M, 6].
     seen = torch.cat((ahead.exists, behind.exists), -1)
-    relative = -torch.cat((ahead.closing, behind.closing), -1)
-    return View(
-        speed,
-        aside,
-        lane,
-        torch.stack((lane + 1 < road.lanes, lane > 0), -1) & sides,
-        ahead,
-        behind,
-        torch.where(follows, torch.log(headway), torch.nan),
-        (relative * seen).sum(-1) / seen.sum(-1).clamp_min(1),
+    faster_by = -torch.cat((ahead.closing, behind.closing), -1)
+    relative_speed = (faster_by * seen).sum(-1) / seen.sum(-1).clamp_min(1)
+
+    return View(speed, aside, lane, exists, ahead, behind, log_headway, relative_speed)
+
+
+def _nearest_on(
+    side: int, scene: Scene, lanes: Tensor, speed: Tensor, aside: Tensor, sides: bool
+) -> Near:
+    """The nearest vehicles ahead (``side`` 1) or behind (-1) in ``lanes`` [N, M, 3].
+
+    ``speed`` and ``aside`` are the vehicles' :func:`velocity`; ``sides`` as in :func:`perceive`.
+    """
+    gap, index = nearest(scene, lanes, side)
+    exists = gap < SIGHT_M
+    if not sides:
+        exists = exists & torch.tensor([False, True, False], device=gap.device)
+    # Nobody's index may be beyond the last vehicle.
+    which = torch.where(exists, index, 0)
+
+    def of_nearest(number: Tensor) -> Tensor:
+        return number.gather(1, which.flatten(1)).view(gap.shape)
+
+    vehicles = scene.vehicles
+    closing = of_nearest(speed) - speed[..., None]
+    to_the_left = of_nearest(vehicles.y) - vehicles.y[..., None]
+    return Near(
+        torch.where(exists, gap, SIGHT_M),
+        torch.where(exists, closing, 0.0),
+        torch.where(exists, of_nearest(vehicles.acceleration), 0.0),
+        torch.where(exists, to_the_left, 0.0),
+        torch.where(exists, of_nearest(aside), 0.0),
+        exists,
+        which,
     )
 
 
@@ -285,45 +325,57 @@ def situation_of(
     vehicles: Vehicles, memory: Memory, road: Road, sides: bool = True, first: Tensor | None = None
 ) -> Situation:
     """What drivers perceive now (:func:`perceive`), with this decision's style in their memory
-    (:func:`with_style`).
+    (:func:`with_style`, as is ``first``).
     """
     view = perceive(vehicles, road, sides)
     return Situation(vehicles, with_style(memory, view, first), road, view)
 
 
 def features_of(situation: Situation) -> Tensor:
-    """What counts for the next move, [N, M, FEATURES]."""
+    """What counts for the next move, [N, M, FEATURES]: 65 numbers without units, of order 1.
+
+    The weights know them by their order, as does the native kernel.
+    """
     view = situation.view
     features = [
         *_own_state(situation),
         *_leader_of_leader(view.ahead),
         *view.exists.to(view.speed.dtype).unbind(-1),
         *_room(situation),
-        *_seen(view.ahead, view.speed).flatten(-2).unbind(-1),
-        *_seen(view.behind, view.speed).flatten(-2).unbind(-1),
+        *_seen(view.ahead, view.speed),
+        *_seen(view.behind, view.speed),
     ]
     return torch.stack(features, -1)
+
+
+def _log_gap(gap: Tensor) -> Tensor:
+    """The logarithm of a gap in m, as a feature: 0 at 10 m."""
+    return torch.log(gap.clamp_min(0.5) / 10.0)
 
 
 def _own_state(situation: Situation) -> list[Tensor]:
     """22 numbers of the driver itself and its place in the lane."""
     vehicles, memory, road, view = situation
-    speed, lane = view.speed, view.lane
+    speed = view.speed
     target = vehicles.target_lane.to(speed.dtype)
+    # To the left of the lanes' centres, m.
     from_target = vehicles.y - road.centre_of(target)
-    from_centre = vehicles.y - road.centre_of(lane)
+    from_centre = vehicles.y - road.centre_of(view.lane)
     return [
+        # Motion along the road.
         speed / 10.0,
         ((vehicles.desired_speed - speed) / 5.0).clamp(-2.0, 2.0),
         # Standing and crawling, told apart finely.
         torch.tanh(speed / 2.0),
         *memory.accelerations.unbind(-1),
         *torch.asinh(memory.closing).unbind(-1),
+        # Place and motion across the road; -1 and 1 are the edges of the lane.
         from_target.clamp(-4.0, 4.0),
         from_centre / road.lane_width_m * 2.0,
-        (target - lane).clamp(-1.0, 1.0),
+        (target - view.lane).clamp(-1.0, 1.0),
         view.aside * 2.0,
         *(memory.lateral_speeds * 2.0).unbind(-1),
+        # Whether it is a lorry, what its memory is worth, and how it drives.
         (vehicles.length > 7.0).to(speed.dtype),
         memory.age.clamp_max(LONGEST) / LONGEST,
         memory.since.clamp_max(LONGEST) / LONGEST,
@@ -335,23 +387,23 @@ def _leader_of_leader(ahead: Near) -> list[Tensor]:
     """3 numbers: gap and closing speed between the leader and its own leader; what the leader
     does.
     """
-    leader = ahead.which[..., 1]
-    exists = ahead.exists[..., 1] & ahead.exists[..., 1].gather(1, leader)
-    gap = torch.where(exists, ahead.gap[..., 1].gather(1, leader), SIGHT_M)
-    closing = torch.where(exists, ahead.closing[..., 1].gather(1, leader), 0.0)
-    return [
-        torch.log(gap.clamp_min(0.5) / 10.0),
-        torch.asinh(closing),
-        ahead.acceleration[..., 1] / 1.5,
-    ]
+    leader = ahead.which[..., SAME]
+    follows = ahead.exists[..., SAME]
+    # What the leader sees ahead of itself, gathered to who follows it, [N, M].
+    exists = follows & follows.gather(1, leader)
+    gap = torch.where(exists, ahead.gap[..., SAME].gather(1, leader), SIGHT_M)
+    closing = torch.where(exists, ahead.closing[..., SAME].gather(1, leader), 0.0)
+    return [_log_gap(gap), torch.asinh(closing), ahead.acceleration[..., SAME] / 1.5]
 
 
 def _room(situation: Situation) -> list[Tensor]:
     """8 numbers: room to those alongside, to the edges of the road, and where the leader is."""
     vehicles, _, road, view = situation
     ahead, width = view.ahead, vehicles.width
+
+    # Who is level with the driver, give or take 1 m; distances of the centres, m, 9 for nobody.
     numbers = []
-    for side, sign in ((2, 1.0), (0, -1.0)):
+    for side, sign in _SIDES:
         nearest_aside = torch.full_like(width, 9.0)
         alongside = torch.zeros_like(vehicles.valid)
         for near in (ahead, view.behind):
@@ -359,66 +411,81 @@ def _room(situation: Situation) -> list[Tensor]:
             distance = torch.where(beside, sign * near.aside[..., side], 9.0)
             nearest_aside = torch.minimum(nearest_aside, distance)
             alongside = alongside | beside
-        numbers += [(nearest_aside - width).clamp(-0.5, 1.5), alongside.to(width.dtype)]
+        # Between the bodies, if the other one is as wide.
+        room = nearest_aside - width
+        numbers += [room.clamp(-0.5, 1.5), alongside.to(width.dtype)]
+
+    # Between the body and the edges, m.
     to_left = road.left_edge_m() - vehicles.y - 0.5 * width
     to_right = vehicles.y - road.right_edge_m() - 0.5 * width
     return [
         *numbers,
         to_left.clamp(-0.5, 1.5),
         to_right.clamp(-0.5, 1.5),
-        ahead.aside[..., 1].clamp(-2.0, 2.0),
-        ahead.lateral_speed[..., 1].clamp(-1.0, 1.0),
+        ahead.aside[..., SAME].clamp(-2.0, 2.0),
+        ahead.lateral_speed[..., SAME].clamp(-1.0, 1.0),
     ]
 
 
-def _seen(near: Near, speed: Tensor) -> Tensor:
-    """5 numbers of each of three neighbours, [N, M, 5, 3]."""
+def _seen(near: Near, speed: Tensor) -> tuple[Tensor, ...]:
+    """15 numbers [N, M]: five kinds, each of the three neighbours in :class:`Near`'s order."""
     exists = near.exists.to(speed.dtype)
+    # Nobody is as far away as can be seen: 2.7 is the logarithm of 150 m in units of 10 m.
+    distance = exists * _log_gap(near.gap) + (1.0 - exists) * 2.7
     pace = speed.clamp_min(3.0)[..., None]
-    # Nobody is as far away as can be seen.
-    distance = exists * torch.log(near.gap.clamp_min(0.5) / 10.0) + (1.0 - exists) * 2.7
     time_s = (near.gap / pace).clamp(-1.0, 5.0) * 0.5
+    # The reciprocal of the time to collision, 1/s.
     approach = (-near.closing / near.gap.clamp_min(2.0)).clamp(-1.0, 1.0) * 3.0
-    return torch.stack((distance, time_s, torch.asinh(near.closing), approach, exists), -2)
+    numbers = torch.stack((distance, time_s, torch.asinh(near.closing), approach, exists), -2)
+    return numbers.flatten(-2).unbind(-1)
 
 
 def _sides_of(situation: Situation) -> Tensor:
     """What counts for a lane change to the left and to the right, [N, M, 2, SIDE_FEATURES], in the
-    same order for both.
+    same order for both: mirrored scenes have mirrored numbers.
     """
     vehicles, memory, road, view = situation
     speed, ahead, behind = view.speed, view.ahead, view.behind
     pace = speed.clamp_min(3.0)
-    own_gap = torch.log(ahead.gap[..., 1].clamp_min(0.5) / 10.0)
-    # On a free lane one could be faster by 3 m/s.
-    here = torch.where(ahead.exists[..., 1], ahead.closing[..., 1], 3.0).clamp(-5.0, 5.0)
+    own_gap = _log_gap(view.gap)
+    # How much faster the lanes are, m/s, [N, M, 3]: on a free lane one could be faster by 3 m/s.
+    gain = torch.where(ahead.exists, ahead.closing, 3.0).clamp(-5.0, 5.0)
+    here = gain[..., SAME]
     from_centre = vehicles.y - road.centre_of(view.lane)
     # A change begins with a decision, not with the drift of a driver who keeps its lane: recorded
     # ones are found by how they move, which a choice of when to begin must not see.
     under_way = (vehicles.target_lane != view.lane).to(speed.dtype)
     since = memory.since.clamp_max(LONGEST) / LONGEST
+
     sides = []
-    for side, sign in ((2, 1.0), (0, -1.0)):
+    for side, sign in _SIDES:
         front, rear = ahead.gap[..., side], behind.gap[..., side]
-        front_closing, rear_closing = ahead.closing[..., side], behind.closing[..., side]
-        there = torch.where(ahead.exists[..., side], front_closing, 3.0).clamp(-5.0, 5.0)
-        towards = torch.where(front < 25.0, ahead.lateral_speed[..., side], 0.0)
-        towards = towards + torch.where(rear < 15.0, behind.lateral_speed[..., side], 0.0)
+        rear_closing = behind.closing[..., side]
+        there = gain[..., side]
+
+        # How fast those who are near move across the road, to the left, m/s.
+        front_aside = torch.where(front < 25.0, ahead.lateral_speed[..., side], 0.0)
+        rear_aside = torch.where(rear < 15.0, behind.lateral_speed[..., side], 0.0)
+
         numbers = [
+            # Room in the new lane and in the old one.
             torch.log1p(front.clamp_min(0.0)) - 2.5,
             torch.log1p(rear.clamp_min(0.0)) - 2.5,
             own_gap,
             (front / pace).clamp(-1.0, 4.0),
             (rear / pace).clamp(-1.0, 4.0),
+            # What there is to gain, m/s.
             there / 3.0,
             rear_closing.clamp(-5.0, 5.0) / 3.0,
             here / 3.0,
             (there - here) / 3.0,
+            # Danger: REAR_BRAKING, FRONT_BRAKING, bodies that nearly touch.
             _needed_braking(rear_closing, rear),
-            _needed_braking(-front_closing, front),
+            _needed_braking(-ahead.closing[..., side], front),
             (1.5 - front).clamp(0.0, 2.0),
             (1.5 - rear).clamp(0.0, 2.0),
-            (sign * towards).clamp(-1.0, 1.0),
+            # Motion towards the new lane, of the others and the driver's own.
+            (sign * (front_aside + rear_aside)).clamp(-1.0, 1.0),
             (sign * view.aside * 3.0).clamp(-3.0, 3.0) * under_way,
             (sign * from_centre).clamp(-1.5, 1.5) * under_way,
             since,
@@ -429,16 +496,21 @@ def _sides_of(situation: Situation) -> Tensor:
 
 def leaves_room(side: Tensor, room_m: float = 2.0, hardest: float = 2.5) -> Tensor:
     """Whether a change to a side [..., SIDE_FEATURES] leaves ``room_m`` ahead and behind and makes
-    nobody brake harder than ``hardest`` m/s2; bool.
+    nobody brake harder than ``hardest`` m/s2; bool [...].
     """
-    nearest = math.log1p(room_m) - 2.5
-    braking = torch.maximum(side[..., REAR_BRAKING], side[..., 10])
-    return (side[..., 0] > nearest) & (side[..., 1] > nearest) & (braking < hardest)
+    # The first two numbers of a side are its gaps ahead and behind, in this unit.
+    least = math.log1p(room_m) - 2.5
+    braking = torch.maximum(side[..., REAR_BRAKING], side[..., FRONT_BRAKING])
+    return (side[..., 0] > least) & (side[..., 1] > least) & (braking < hardest)
 
 
 def _needed_braking(closing: Tensor, gap: Tensor) -> Tensor:
-    """Deceleration that keeps the rear one off the front one, m/s2, at most 8."""
-    return (closing.clamp_min(0.0).square() / (2.0 * (gap - 1.0).clamp_min(0.3))).clamp_max(8.0)
+    """Deceleration that keeps the rear one off the front one, m/s2, at most 8.
+
+    It stops closing in over the gap but its last metre: v^2 / (2 s).
+    """
+    distance = (gap - 1.0).clamp_min(0.3)
+    return (closing.clamp_min(0.0).square() / (2.0 * distance)).clamp_max(8.0)
 
 
 def layers(*widths: int) -> nn.Sequential:
@@ -452,7 +524,8 @@ def layers(*widths: int) -> nn.Sequential:
 class HumanPolicy(nn.Module):
     """Distributions of a driver's next move; below 50,000 weights.
 
-    One network for both tokens, a small one of its own for lane changes, which are rare.
+    One network for both tokens, a small one of its own for lane changes, which are rare. It judges
+    both sides alike, with two logits for each: to begin a change, and to break one off.
     """
 
     def __init__(self, sizes: HumanSizes) -> None:
@@ -464,7 +537,9 @@ class HumanPolicy(nn.Module):
         self.lane = layers(SIDE_FEATURES, sizes.lane_hidden, 2)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits of the tokens along [..., 41] and across [..., 31]."""
+        """Logits of the tokens :data:`ALONG` [..., 41] and :data:`ACROSS` [..., 31] from the
+        features [..., FEATURES].
+        """
         inner = self.trunk(features)
         return self.along(inner), self.across(inner)
 
@@ -472,20 +547,31 @@ class HumanPolicy(nn.Module):
         """Probabilities [..., 3]: to go on; to begin a change to the left, or break one off; to
         begin one to the right. ``factor``: of the probabilities to begin one.
         """
-        logits = self.lane(choice.sides)
-        begin = torch.sigmoid(logits[..., 0]) * choice.exists * (_MOST_LIKELY * factor)
+        to_begin, to_stop = self.lane(choice.sides).unbind(-1)
+
+        # Of the changes to the left and to the right, [..., 2].
+        begin = torch.sigmoid(to_begin) * choice.exists * (_MOST_LIKELY * factor)
         total = begin.sum(-1, keepdim=True).clamp_min(1e-9)
         begin = begin * (total.clamp_max(_MOST_LIKELY) / total)
-        stop = torch.sigmoid(torch.where(choice.to_left, logits[..., 0, 1], logits[..., 1, 1]))
+
+        # Of the side to which a change is under way.
+        stop = torch.sigmoid(torch.where(choice.to_left, to_stop[..., 0], to_stop[..., 1]))
+
         first = torch.where(choice.keeping, begin[..., 0], stop).clamp_min(1e-9)
         second = torch.where(choice.keeping, begin[..., 1], 0.0).clamp_min(1e-9)
-        return torch.stack(((1.0 - first - second).clamp_min(1e-6), first, second), -1)
+        # All of them have finite logarithms, which fine-tuning takes.
+        go_on = (1.0 - first - second).clamp_min(1e-6)
+        return torch.stack((go_on, first, second), -1)
 
 
 class LaneChoice(NamedTuple):
-    """What a lane choice depends on: ``sides`` [..., 2, SIDE_FEATURES], left and right in the same
-    order; whether lanes exist [..., 2]; whether the driver is in its target lane, and whether a
-    change under way goes to the left, [...].
+    """What a lane choice depends on.
+
+    Attributes:
+        sides: what counts for a change to the left and to the right, [..., 2, SIDE_FEATURES].
+        exists: whether there are lanes, [..., 2].
+        keeping: whether the driver is in its target lane, [...].
+        to_left: whether a change under way goes to the left, [...].
     """
 
     sides: Tensor
@@ -496,47 +582,59 @@ class LaneChoice(NamedTuple):
 
 def lane_choice(situation: Situation) -> LaneChoice:
     """The choice that each driver has."""
-    view, target = situation.view, situation.vehicles.target_lane
-    lane = view.lane.long()
-    return LaneChoice(_sides_of(situation), view.exists, target == lane, target > lane)
+    target = situation.vehicles.target_lane
+    lane = situation.view.lane.long()
+    sides = _sides_of(situation)
+    return LaneChoice(sides, situation.view.exists, target == lane, target > lane)
 
 
 def with_choice(situation: Situation, choice: Tensor) -> Situation:
     """The situation after a ``choice`` [N, M] of 0, 1 or 2 (:meth:`HumanPolicy.lane_chances`): who
     has chosen another lane heads for it and counts anew.
     """
-    vehicles, memory, _, view = situation
+    vehicles, memory, road, view = situation
     old, lane = vehicles.target_lane, view.lane.long()
+
+    # Who keeps its lane may begin a change; who is on its way may go back to its lane.
     step = (choice == 1).long() - (choice == 2).long()
-    target = torch.where(old == lane, old + step, torch.where(choice == 1, lane, old))
+    broken_off = torch.where(choice == 1, lane, old)
+    target = torch.where(old == lane, old + step, broken_off)
+
     since = torch.where(target != old, 0.0, memory.since)
-    return situation._replace(
-        vehicles=vehicles.with_(target_lane=target), memory=memory._replace(since=since)
-    )
+    vehicles = vehicles.with_(target_lane=target)
+    return Situation(vehicles, memory._replace(since=since), road, view)
 
 
 def chosen(chances: Tensor, u: Tensor) -> Tensor:
     """A choice [N, M] with these ``chances`` [N, M, 3] from uniform numbers [N, M]."""
-    return (u < chances[..., 1]).long() + 2 * (u >= 1.0 - chances[..., 2]).long()
+    # Choice 1 takes the lower end of [0, 1), choice 2 the upper one, 0 what is between them.
+    first = u < chances[..., 1]
+    second = u >= 1.0 - chances[..., 2]
+    return first.long() + 2 * second.long()
 
 
 def with_style(memory: Memory, view: View, first: Tensor | None = None) -> Memory:
-    """The memory with this decision's style.
+    """The memory with this decision's style: an exponential mean over :data:`STYLE_S`.
 
     ``first`` [N, M]: drivers seen for the first time, who have closed in as they do now.
     """
     old = memory.style
     free = view.log_headway.isnan()
+
+    # What the driver shows now, [N, M, 3]; without a leader its headway stays what it was.
     headway = torch.where(free, old[..., 0], view.log_headway)
     effort = memory.accelerations[..., 0].square()
     pace = (view.relative_speed / 3.0).clamp(-2.0, 2.0)
-    share = DECISION_S / STYLE_S
-    style = old + share * (torch.stack((headway, effort, pace), -1) - old)
+    shown = torch.stack((headway, effort, pace), -1)
+
+    style = old + DECISION_S / STYLE_S * (shown - old)
     if first is None:
         return memory._replace(style=style)
-    # Who follows nobody yet is taken to keep 2 s.
+
+    # Who follows nobody yet is taken to keep 2 s; everybody begins with a middling effort.
     headway = torch.where(free, math.log(2.0), view.log_headway)
-    begun = torch.stack((headway, torch.full_like(headway, 0.5), pace), -1)
+    effort = torch.full_like(headway, 0.5)
+    begun = torch.stack((headway, effort, pace), -1)
     first = first[..., None]
     return memory._replace(
         style=torch.where(first, begun, style),
@@ -549,26 +647,41 @@ def bounded(situation: Situation, change: Tensor, aside: Tensor) -> tuple[Tensor
 
     Nobody rolls back, moves aside faster than a car can, or steers off the road: a body reaches the
     edge in :data:`EDGE_S` at the soonest, and comes back from beyond it.
+
+    Args:
+        situation: of drivers [N, M].
+        change: of the acceleration since the last decision, m/s2, [N, M].
+        aside: change of the lateral speed, m/s, [N, M].
     """
     vehicles, memory, road, view = situation
+
     acceleration = memory.accelerations[..., 0] + change
     acceleration = acceleration.clamp(HARDEST_BRAKING, STRONGEST_ACCELERATION)
+    # At most to a stop.
     acceleration = torch.maximum(acceleration, -view.speed / DECISION_S)
+
+    # Lateral speeds that reach the edges just then, m/s; below 0 where the body is beyond one.
     half = 0.5 * vehicles.width + EDGE_M
     to_left = (road.left_edge_m() - vehicles.y - half) / EDGE_S
     to_right = (vehicles.y - road.right_edge_m() - half) / EDGE_S
-    lateral = torch.maximum(torch.minimum(view.aside + aside, to_left), -to_right)
+    lateral = torch.minimum(view.aside + aside, to_left)
+    lateral = torch.maximum(lateral, -to_right)
+
     most = (STEEPEST * view.speed).clamp_max(FASTEST_ASIDE_MPS)
     return acceleration, lateral.clamp(-most, most)
 
 
 def remembered(situation: Situation, acceleration: Tensor) -> Memory:
-    """The memory a decision later."""
+    """The memory a decision later, of drivers who held this ``acceleration`` [N, M], m/s2."""
     _, memory, _, view = situation
+    # Newest first; the oldest is forgotten.
+    accelerations = torch.cat((acceleration[..., None], memory.accelerations[..., :-1]), -1)
+    lateral_speeds = torch.stack((view.aside, memory.lateral_speeds[..., 0]), -1)
+    closing = torch.stack((view.closing, memory.closing[..., 0]), -1)
     return Memory(
-        torch.cat((acceleration[..., None], memory.accelerations[..., :-1]), -1),
-        torch.stack((view.aside, memory.lateral_speeds[..., 0]), -1),
-        torch.stack((view.closing, memory.closing[..., 0]), -1),
+        accelerations,
+        lateral_speeds,
+        closing,
         memory.style,
         memory.age + 1.0,
         memory.since + 1.0,
@@ -576,19 +689,23 @@ def remembered(situation: Situation, acceleration: Tensor) -> Memory:
 
 
 def moved(vehicles: Vehicles, acceleration: Tensor, aside: Tensor) -> Vehicles:
-    """The vehicles 0.4 s later: constant acceleration, lateral speed changing evenly."""
+    """The vehicles 0.4 s later: constant ``acceleration``, m/s2, and a lateral speed that changes
+    evenly to ``aside``, m/s, [N, M] both.
+    """
     speed, lateral = velocity(vehicles)
     later = (speed + acceleration * DECISION_S).clamp_min(0.0)
+    # At the mean of the speeds before and after.
     x = vehicles.x + 0.5 * (speed + later) * DECISION_S
     y = vehicles.y + 0.5 * (lateral + aside) * DECISION_S
-    return with_velocity(vehicles.with_(x=x, y=y, acceleration=acceleration), later, aside)
+    vehicles = vehicles.with_(x=x, y=y, acceleration=acceleration)
+    return with_velocity(vehicles, later, aside)
 
 
 def cars(x: Tensor, y: Tensor, speed: Tensor, aside: Tensor, **others: Tensor) -> Vehicles:
     """Vehicles at these speeds along and across the road, m/s, seen where their centres are.
 
-    ``others``: the further fields but heading and visibility; all are valid unless it says
-    otherwise.
+    Positions of the centres in m, all [N, M]. ``others``: the further fields but heading and
+    visibility; all are valid unless it says otherwise.
     """
     vehicles = Vehicles(
         x=x,
@@ -602,7 +719,9 @@ def cars(x: Tensor, y: Tensor, speed: Tensor, aside: Tensor, **others: Tensor) -
 
 
 def with_velocity(vehicles: Vehicles, along: Tensor, across: Tensor) -> Vehicles:
-    """The vehicles at these speeds, m/s; nobody moves more aside than a fifth of its way ahead."""
+    """The vehicles at these speeds [N, M], m/s; nobody moves more aside than a fifth of its way
+    ahead.
+    """
     # Who stands keeps its heading.
     moves = along > 0.0
     across = across.clamp(-0.2 * along, 0.2 * along)

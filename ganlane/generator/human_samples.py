@@ -4,6 +4,10 @@ A sample is a driver at a decision. *Teacher* samples are cut from the recording
 *closed-loop* samples the policy drives: of several moves that it draws, the one nearest to the
 recording is made, and the sample is what would lead back to the recording. Positions are smoothed
 first, since a camera's noise is no driver's wish (docs/generators.md).
+
+The way of the data: recordings, :func:`smooth_scene`, :func:`cuts` in time, :func:`batches` of
+segments [B, T, M] (B stretches of T frames of 0.1 s and M vehicles), :func:`samples_of` every
+decision in them.
 """
 
 from __future__ import annotations
@@ -63,6 +67,8 @@ EXACT_TIMES = 2.0
 SPEED_GAIN = 0.5
 PLACE_GAIN = 0.08
 LATERAL_GAIN = 0.3
+#: Draws random numbers [N, M], or of a shape that it is asked for.
+Draw = Callable[..., Tensor]
 #: Pairs of vehicles in a batch; bounds the memory.
 _MOST_PAIRS = 300_000
 
@@ -95,21 +101,23 @@ def smooth(track: Floats, cutoff_hz: float) -> Floats:
 
     A Gaussian; beyond its ends the track is continued by its own point reflection.
     """
-    # The transform of a Gaussian is one half at this frequency.
+    # The standard deviation at which the transform of a Gaussian is one half at this frequency.
     frames = np.sqrt(np.log(2.0) / 2.0) / (np.pi * cutoff_hz * PHYSICS_STEP_S)
+    # Four of them hold nearly all of its weight.
     reach = min(len(track) - 1, int(4.0 * frames) + 1)
     longer = np.pad(track, reach, "reflect", reflect_type="odd")
     return gaussian_filter1d(longer, frames)[reach : reach + len(track)]
 
 
 def smooth_scene(recording: Recording, config: HumanConfig, weight: float = 1.0) -> SmoothScene:
-    """The recording smoothed, with the drivers' target lanes."""
-    lanes, lane_width_m = recording.lanes, recording.lane_width_m
+    """The recording smoothed, with the drivers' target lanes; ``weight`` is that of its samples."""
     x, y = recording.x.copy(), recording.y.copy()
     speed, lateral_speed = np.zeros_like(x), np.zeros_like(y)
     target = np.zeros(x.shape, np.int64)
+
     for track in range(x.shape[1]):
         rows = np.flatnonzero(recording.present[:, track])
+        # From its first to its last frame.
         part = slice(rows[0], rows[-1] + 1), track
         # A shorter track shows no motion.
         if len(rows) >= 3:
@@ -117,7 +125,10 @@ def smooth_scene(recording: Recording, config: HumanConfig, weight: float = 1.0)
             y[part] = smooth(y[part], config.lateral_cutoff_hz)
             speed[part] = np.gradient(x[part], PHYSICS_STEP_S).clip(0.0)
             lateral_speed[part] = np.gradient(y[part], PHYSICS_STEP_S)
-        target[part] = target_lanes(y[part], lateral_speed[part], lane_width_m, lanes)
+        target[part] = target_lanes(
+            y[part], lateral_speed[part], recording.lane_width_m, recording.lanes
+        )
+
     same = {part.name: getattr(recording, part.name) for part in fields(Recording)}
     return SmoothScene(
         **same | {"x": x, "y": y, "speed": speed},
@@ -147,17 +158,27 @@ def target_lanes(y: Floats, lateral_speed: Floats, width_m: float, lanes: int) -
     """The lane [T] that a driver heads for: from the start of a change on the new one.
 
     A change counts if the track stays for 0.5 s in each of the two lanes.
+
+    Args:
+        y: [T] place across the road, m.
+        lateral_speed: [T] m/s.
+        width_m: of a lane.
+        lanes: of the road.
     """
     lane = np.rint(y / width_m).clip(0, lanes - 1).astype(np.int64)
     target = lane.copy()
+
+    # The last frames before the track crosses from one lane to another.
     for last in np.flatnonzero(np.diff(lane)):
         old, new = lane[last], lane[last + 1]
-        before, after = lane[max(0, last - 4) : last + 1], lane[last + 1 : last + 6]
+        before = lane[max(0, last - 4) : last + 1]
+        after = lane[last + 1 : last + 6]
         if (before != old).any() or (after != new).any():
             continue
+
+        # Back to where the driver set out.
         side = np.sign(new - old)
         begin = last
-        # Back to where the driver set out.
         while (
             begin > 0
             and lane[begin - 1] == old
@@ -170,7 +191,20 @@ def target_lanes(y: Floats, lateral_speed: Floats, width_m: float, lanes: int) -
 
 
 class Segments(NamedTuple):
-    """B stretches of scenes side by side, [B, T, M] each; the present is frame :data:`HISTORY`."""
+    """B stretches of scenes side by side; the present of the first decision is frame
+    :data:`HISTORY`.
+
+    Attributes:
+        x, y: smoothed places along and across the road, m, [B, T, M]; ``raw_x`` and ``raw_y`` are
+            the recorded ones.
+        speed, lateral_speed: m/s, [B, T, M].
+        target: lane that the driver heads for, [B, T, M].
+        present: who is in the recording, [B, T, M].
+        length, width: of the bodies, m, [B, M].
+        driven: [B, M]; the other vehicles move as recorded and are in no sample.
+        lanes, lane_width_m: of the roads, [B, 1]; the width in m.
+        weight: of the samples, [B, 1].
+    """
 
     x: Tensor
     y: Tensor
@@ -226,7 +260,14 @@ class Segments(NamedTuple):
 
 
 class Cut(NamedTuple):
-    """A stretch of a scene: its first frame (before which history is missing) and its vehicles."""
+    """A stretch of a scene.
+
+    Attributes:
+        scene: that it is cut from.
+        start: its first frame; below 0 where history is missing.
+        frames: how many it has, T.
+        who: columns of its vehicles in the scene, [M].
+    """
 
     scene: SmoothScene
     start: int
@@ -238,9 +279,12 @@ class Cut(NamedTuple):
         first = max(self.start, 0)
         frames = slice(first, self.start + self.frames)
         inside = getattr(self.scene, name)[frames, self.who]
+
+        # Frames of the stretch that the scene does not have.
         before = first - self.start
         after = self.frames - before - len(inside)
         field = np.pad(inside, ((before, after), (0, 0)))
+
         if field.dtype == np.float64:
             field = field.astype(np.float32)
         if name in ("x", "raw_x"):
@@ -254,12 +298,15 @@ IN_FRAMES = ("x", "y", "raw_x", "raw_y", "speed", "lateral_speed", "target", "pr
 
 
 def cuts(scenes: Sequence[SmoothScene], decisions: int, stride: int) -> list[Cut]:
-    """Stretches of ``decisions`` that begin every ``stride`` frames."""
-    frames = HISTORY + STEPS * (decisions + 1) + 1
+    """Stretches of ``decisions`` that begin every ``stride`` frames, with their history before."""
+    # The last decision needs what followed it.
+    present_frames = STEPS * (decisions + 1) + 1
+    frames = HISTORY + present_frames
     stretches = []
     for scene in scenes:
+        # A stretch may end after its scene, which has three more moves at least if it is that long.
         for start in range(0, max(1, len(scene.x) - STEPS * 3), stride):
-            who = scene.present[start : start + frames - HISTORY].any(0)
+            who = scene.present[start : start + present_frames].any(0)
             if who.any():
                 stretches.append(Cut(scene, start - HISTORY, frames, np.flatnonzero(who)))
     return stretches
@@ -269,6 +316,7 @@ def batches(stretches: Sequence[Cut]) -> Iterator[Segments]:
     """The stretches side by side, those with about as many vehicles together."""
     waiting: list[Cut] = []
     for stretch in sorted(stretches, key=lambda cut: len(cut.who)):
+        # The newest is the widest, to which the others are filled up.
         pairs = (len(waiting) + 1) * len(stretch.who) ** 2
         if waiting and pairs > _MOST_PAIRS:
             yield segments_of(waiting)
@@ -300,31 +348,40 @@ def segments_of(stretches: Sequence[Cut]) -> Segments:
     )
 
 
-def recorded(s: Segments, decision: int, desired: Tensor) -> tuple[Vehicles, Memory]:
-    """Vehicles and memories as recorded at a decision; style and closing speeds are empty."""
-    # The present, and the decisions before it, newest first.
+def recorded(segments: Segments, decision: int, desired: Tensor) -> tuple[Vehicles, Memory]:
+    """Vehicles and memories [B, M] as recorded at a decision; style and closing speeds are empty.
+
+    ``desired`` [B, M] are the desired speeds, m/s.
+    """
+    # The present, and the decisions before it, newest first: [B, 1 + ACCELERATIONS, M].
     frames = HISTORY + STEPS * (decision - torch.arange(ACCELERATIONS + 1))
     now = frames[0]
-    speed, aside = s.speed[:, frames], s.lateral_speed[:, frames]
-    present = s.present[:, frames]
+    speed, aside = segments.speed[:, frames], segments.lateral_speed[:, frames]
+    present = segments.present[:, frames]
+
+    # Mean accelerations between two decisions, as far back as the driver was recorded.
     without_gap = present.cumprod(1)[:, 1:]
     changes = (speed[:, :-1] - speed[:, 1:]) / DECISION_S
     accelerations = torch.where(without_gap > 0, changes, 0.0).movedim(1, -1)
+    age = without_gap.sum(1).to(speed.dtype)
+
+    # Where nothing was recorded, the present lateral speed.
     past = slice(1, LATERAL_SPEEDS + 1)
     lateral_speeds = torch.where(present[:, past], aside[:, past], aside[:, :1]).movedim(1, -1)
+
     vehicles = cars(
-        s.x[:, now],
-        s.y[:, now],
+        segments.x[:, now],
+        segments.y[:, now],
         speed[:, 0],
         aside[:, 0],
         acceleration=accelerations[..., 0],
-        length=s.length,
-        width=s.width,
+        length=segments.length,
+        width=segments.width,
         desired_speed=desired,
-        target_lane=s.target[:, now],
+        target_lane=segments.target[:, now],
         valid=present[:, 0],
     )
-    return vehicles, memory_of(accelerations, lateral_speeds, without_gap.sum(1).to(speed.dtype))
+    return vehicles, memory_of(accelerations, lateral_speeds, age)
 
 
 class Moves(NamedTuple):
@@ -332,8 +389,9 @@ class Moves(NamedTuple):
 
     Attributes:
         features: [R, FEATURES] what drivers perceive.
-        change, aside: [R] of the acceleration and of the lateral speed, that should follow.
-        weight, lateral_weight: [R].
+        change, aside: [R] of the acceleration, m/s2, and of the lateral speed, m/s, that should
+            follow.
+        weight, lateral_weight: [R] of the sample in the fit of either.
     """
 
     features: Tensor
@@ -351,7 +409,8 @@ class Choices(NamedTuple):
     """Samples of lane choices.
 
     Attributes:
-        sides: of drivers that could begin a lane change on a side, or are on one, [S, SIDE].
+        sides: of drivers that could begin a lane change on a side, or are on one,
+            [S, SIDE_FEATURES].
         begins: [S] 1 where it begins, 0 where not, -1 where a change is under way.
         keeping_sides, keeping_exists: [K, 2, ...] of drivers in their lanes, as in
             :class:`~ganlane.generator.human.LaneChoice`.
@@ -379,15 +438,21 @@ class Samples(NamedTuple):
 def joined(parts: Sequence[Samples]) -> Samples:
     """All samples of the parts."""
     moves, choices = zip(*parts)
-    return Samples(Moves(*map(torch.cat, zip(*moves))), Choices(*map(torch.cat, zip(*choices))))
+    all_moves = Moves(*map(torch.cat, zip(*moves)))
+    all_choices = Choices(*map(torch.cat, zip(*choices)))
+    return Samples(all_moves, all_choices)
 
 
 class Options(NamedTuple):
     """How samples are cut.
 
-    ``policy`` drives, if given, by the nearest of ``samples`` moves; with an ``estimator``, from
-    where nine noisy positions show it. ``vary``: mirror and widen; ``scale``: lengthen by up to
-    this share; ``blind``: share of batches without side lanes.
+    Attributes:
+        policy: that drives, in closed loop; None: everybody drives as recorded.
+        estimator: drivers begin where it sees them by nine noisy positions; None: as recorded.
+        samples: moves that the policy draws, the nearest of which is made.
+        vary: mirror and widen the segments at random.
+        scale: lengthen them by up to this share.
+        blind: share of batches without side lanes.
     """
 
     policy: HumanPolicy | None = None
@@ -405,88 +470,128 @@ def samples_of(stretches: Sequence[Cut], options: Options, random: torch.Generat
 
 
 def _samples(segments: Segments, options: Options, random: torch.Generator) -> Samples:
-    """Samples of one batch."""
-    s = varied(segments, options, random)
-    top = torch.where(s.present, s.speed, 0.0).amax(1)
+    """Samples of one batch: its vehicles are driven from decision to decision."""
+    segments = varied(segments, options, random)
+    top = torch.where(segments.present, segments.speed, 0.0).amax(1)
     above = DESIRED_ABOVE_MPS * torch.rand(top.shape, generator=random)
     desired = (top + above).clamp(*DESIRED_MPS)
     # A policy for single lanes, too, has to do without the sides now and then.
     sides_seen = not (options.blind and torch.rand((), generator=random) < options.blind)
-    vehicles, memory = recorded(s, 0, desired)
+
+    # Before the first decision nobody is there, so that everybody comes at it.
+    vehicles, memory = recorded(segments, 0, desired)
     vehicles = vehicles.with_(valid=torch.zeros_like(vehicles.valid))
+
+    closed_loop = options.policy is not None
+    driven = segments.driven & closed_loop
     parts = []
-    decisions = (s.x.shape[1] - HISTORY - 1) // STEPS - 1
+    decisions = (segments.x.shape[1] - HISTORY - 1) // STEPS - 1
     for decision in range(decisions):
-        now = HISTORY + STEPS * decision
-        as_recorded, its_memory = recorded(s, decision, desired)
-        present = as_recorded.valid
-        first = present & ~vehicles.valid
-        # As recorded: everybody, or who has just come, and who is not driven.
-        replace = present if options.policy is None else first | (present & ~s.driven)
-        changed = (as_recorded.target_lane != vehicles.target_lane) & present & ~first
-        since = torch.where(changed, 0.0, torch.where(first, LONG_AGO, memory.since))
-        vehicles = as_recorded.where(replace, vehicles)
-        vehicles = vehicles.with_(valid=present, target_lane=as_recorded.target_lane)
-        memory = _taken(memory, its_memory, replace)._replace(since=since)
+        as_recorded = recorded(segments, decision, desired)
+        vehicles, memory, first = _with_recorded(vehicles, memory, *as_recorded, driven)
         if options.estimator is not None and decision == 0:
-            vehicles, memory = _estimated(s, vehicles, memory, options.estimator, random)
-        situation = situation_of(vehicles, memory, s.road, sides_seen, first)
+            vehicles, memory = _estimated(segments, vehicles, memory, options.estimator, random)
+        situation = situation_of(vehicles, memory, segments.road, sides_seen, first)
         features = features_of(situation)
+
         # What should follow: the recorded move, corrected towards the recording.
-        change, aside = _led_back(s, now, situation)
-        follows = s.present[:, now + STEPS] & present & s.driven
+        now = HISTORY + STEPS * decision
+        change, aside = _led_back(segments, now, situation)
+        follows = segments.present[:, now + STEPS] & vehicles.valid & segments.driven
         # A driver that has just come knows no acceleration of its own yet.
-        counts = follows & (memory.age > 0) if options.policy is None else follows
-        weight = s.weight.expand_as(change)
-        moves = Moves(features, change, aside, weight, weight * s.two_dimensional)
-        step = s.target[:, now + STEPS] - vehicles.target_lane
-        choices = _choices(lane_choice(situation), follows & s.two_dimensional, step)
+        counts = follows if closed_loop else follows & (memory.age > 0)
+        weight = segments.weight.expand_as(change)
+        moves = Moves(features, change, aside, weight, weight * segments.two_dimensional)
+
+        # Whether the target lane changes until the next decision.
+        step = segments.target[:, now + STEPS] - vehicles.target_lane
+        choices = _choices(lane_choice(situation), follows & segments.two_dimensional, step)
         parts.append(Samples(moves.rows(counts), choices))
+
         # In closed loop the policy makes the move itself, so that it sees its own mistakes.
-        if options.policy is not None:
+        if closed_loop:
             change, aside = _nearest_move(options, features, change, aside, random)
-            aside = torch.where(s.two_dimensional, aside, 0.0)
+            aside = torch.where(segments.two_dimensional, aside, 0.0)
         acceleration, lateral = bounded(situation, change, aside)
         memory = remembered(situation, acceleration)
         vehicles = moved(vehicles, acceleration, lateral)
     return joined(parts)
 
 
+def _with_recorded(
+    vehicles: Vehicles,
+    memory: Memory,
+    recorded_vehicles: Vehicles,
+    recorded_memory: Memory,
+    driven: Tensor,
+) -> tuple[Vehicles, Memory, Tensor]:
+    """Vehicles and memories [B, M] at a decision, and who is there for the first time.
+
+    Who has just come, and who is not ``driven`` [B, M], is as recorded. All head for the lanes that
+    they headed for in the recording.
+    """
+    present, target = recorded_vehicles.valid, recorded_vehicles.target_lane
+    first = present & ~vehicles.valid
+    replaced = present & (first | ~driven)
+
+    # The time since a lane change began or ended is counted here: a recording does not hold it.
+    changed = (target != vehicles.target_lane) & present & ~first
+    since = torch.where(first, LONG_AGO, memory.since)
+    since = torch.where(changed, 0.0, since)
+
+    vehicles = recorded_vehicles.where(replaced, vehicles)
+    vehicles = vehicles.with_(valid=present, target_lane=target)
+    memory = _taken(memory, recorded_memory, replaced)._replace(since=since)
+    return vehicles, memory, first
+
+
 def _estimated(
-    s: Segments, vehicles: Vehicles, memory: Memory, estimator: Estimator, random: torch.Generator
+    segments: Segments,
+    vehicles: Vehicles,
+    memory: Memory,
+    estimator: Estimator,
+    random: torch.Generator,
 ) -> tuple[Vehicles, Memory]:
     """Driven vehicles as nine positions show them, with less or more noise than recorded."""
     nine = slice(HISTORY - OBSERVED_POSITIONS + 1, HISTORY + 1)
-    whole = s.present[:, nine].all(1) & s.driven
-    noise = noise_shares(len(s.x), 0.2, 0.7, random)
-    x = s.x[:, nine] + noise * (s.raw_x - s.x)[:, nine]
-    y = s.y[:, nine] + noise * (s.raw_y - s.y)[:, nine]
+    whole = segments.present[:, nine].all(1) & segments.driven
+
+    # Positions [B, M, 9, 2], m: the smoothed ones, and a share of the recorded noise.
+    noise = noise_shares(len(segments.x), 0.2, 0.7, random)
+    x = segments.x[:, nine] + noise * (segments.raw_x - segments.x)[:, nine]
+    y = segments.y[:, nine] + noise * (segments.raw_y - segments.y)[:, nine]
     positions = torch.stack((x, y), -1).transpose(1, 2)
+
+    # The motion [B, M, 7] is speed, two accelerations, two lateral speeds, and where the driver is
+    # from the last position.
     last = positions[:, :, -1]
     motion = estimator(positions - last[:, :, None])
-    its_memory = present_memory(motion, trust(positions))
     x, y = (last + motion[..., 5:]).unbind(-1)
     seen = vehicles.with_(x=x, y=y, acceleration=motion[..., 1])
     seen = with_velocity(seen, motion[..., 0].clamp_min(0.0), motion[..., 3])
-    return seen.where(whole, vehicles), _taken(memory, its_memory, whole)
+
+    seen_memory = present_memory(motion, trust(positions))
+    return seen.where(whole, vehicles), _taken(memory, seen_memory, whole)
 
 
 def varied(segments: Segments, options: Options, random: torch.Generator) -> Segments:
     """The segments mirrored, widened and lengthened at random."""
     rand, _ = draws((len(segments.x), 1), random)
     if options.vary:
+        # All of them or none.
         if torch.rand((), generator=random) < 0.5:
             segments = segments.mirrored()
+        # From 5 % narrower to 20 % wider.
         segments = segments.widened(0.95 + 0.25 * rand())
     if options.scale:
         segments = segments.scaled(1.0 + options.scale * rand())
     return segments
 
 
-def draws(
-    shape: tuple[int, ...], random: torch.Generator
-) -> tuple[Callable[..., Tensor], Callable[..., Tensor]]:
-    """Uniform and standard normal numbers, of this shape or of another that is asked for."""
+def draws(shape: tuple[int, ...], random: torch.Generator) -> tuple[Draw, Draw]:
+    """Functions that draw uniform and standard normal numbers, of this shape or of another one
+    that they are asked for.
+    """
 
     def rand(*size: int) -> Tensor:
         return torch.rand(size or shape, generator=random)
@@ -498,7 +603,7 @@ def draws(
 
 
 def _taken(memory: Memory, other: Memory, where: Tensor) -> Memory:
-    """The memory with accelerations, lateral speeds and age of ``other`` [N, M]."""
+    """The memory with accelerations, lateral speeds and age of ``other`` at ``where`` [B, M]."""
     many = where[..., None]
     return memory._replace(
         accelerations=torch.where(many, other.accelerations, memory.accelerations),
@@ -507,29 +612,37 @@ def _taken(memory: Memory, other: Memory, where: Tensor) -> Memory:
     )
 
 
-def _led_back(s: Segments, now: int, situation: Situation) -> tuple[Tensor, Tensor]:
-    """Changes of acceleration and lateral speed that follow the recording, or lead back to it."""
+def _led_back(segments: Segments, now: int, situation: Situation) -> tuple[Tensor, Tensor]:
+    """Changes [B, M] of acceleration, m/s2, and lateral speed, m/s, that follow the recording from
+    frame ``now`` on, or lead back to it.
+    """
     vehicles, memory, _, view = situation
-    recorded_acceleration = (s.speed[:, now + STEPS] - s.speed[:, now]) / DECISION_S
-    wanted = (
-        recorded_acceleration
-        + SPEED_GAIN * (s.speed[:, now] - view.speed)
-        + PLACE_GAIN * (s.x[:, now] - vehicles.x)
-    ).clamp(HARDEST_BRAKING, STRONGEST_ACCELERATION)
-    wanted_aside = s.lateral_speed[:, now + STEPS] + LATERAL_GAIN * (s.y[:, now] - vehicles.y)
+
+    # A proportional controller on top of the recorded motion.
+    recorded_acceleration = (segments.speed[:, now + STEPS] - segments.speed[:, now]) / DECISION_S
+    for_speed = SPEED_GAIN * (segments.speed[:, now] - view.speed)
+    for_place = PLACE_GAIN * (segments.x[:, now] - vehicles.x)
+    wanted = recorded_acceleration + for_speed + for_place
+    wanted = wanted.clamp(HARDEST_BRAKING, STRONGEST_ACCELERATION)
+
+    for_place_across = LATERAL_GAIN * (segments.y[:, now] - vehicles.y)
+    wanted_aside = segments.lateral_speed[:, now + STEPS] + for_place_across
     return wanted - memory.accelerations[..., 0], wanted_aside - view.aside
 
 
 def _nearest_move(
     options: Options, features: Tensor, change: Tensor, aside: Tensor, random: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Of several moves that the policy draws, the nearest ones to ``change`` and ``aside``."""
+    """Of several moves that the policy draws, the nearest ones to ``change`` and ``aside`` [B, M],
+    for each of the two alone.
+    """
     assert options.policy is not None
-    logits = options.policy(features)
+    logits_of_both = options.policy(features)
     nearest = []
-    for tokens, its_logits, wanted in zip((ALONG, ACROSS), logits, (change, aside)):
+    for tokens, logits, wanted in zip((ALONG, ACROSS), logits_of_both, (change, aside)):
+        # [samples, B, M] values, the index of the best one of each driver [1, B, M].
         u = torch.rand((options.samples, *wanted.shape), generator=random)
-        drawn = tokens.sample(its_logits.expand(options.samples, *its_logits.shape), u)
+        drawn = tokens.sample(logits.expand(options.samples, *logits.shape), u)
         best = (drawn - wanted).abs().argmin(0, keepdim=True)
         nearest.append(drawn.gather(0, best)[0])
     return nearest[0], nearest[1]
@@ -539,16 +652,17 @@ def _choices(choice: LaneChoice, counts: Tensor, step: Tensor) -> Choices:
     """What was chosen at one decision by the drivers who count (``counts`` [N, M]), whose target
     lanes change by ``step`` [N, M] until the next one.
     """
-    # A change begins at the decision after which the target lane is another one.
+    # A change begins at the decision after which the target lane is another one: to the left, to
+    # the right, [N, M, 2].
     begins = torch.stack((step == 1, step == -1), -1)
     keeping = counts & choice.keeping
     could = choice.exists & keeping[..., None]
+
+    # The side to which a change is under way, [drivers under way, SIDE_FEATURES].
     under_way = counts & ~choice.keeping
     left, right = choice.sides.unbind(-2)
     aside = torch.where(choice.to_left[..., None], left, right)[under_way]
-    return Choices(
-        torch.cat((choice.sides[could], aside)),
-        torch.cat((begins[could].float(), torch.full((len(aside),), -1.0))),
-        choice.sides[keeping],
-        choice.exists[keeping],
-    )
+
+    sides = torch.cat((choice.sides[could], aside))
+    labels = torch.cat((begins[could].float(), torch.full((len(aside),), -1.0)))
+    return Choices(sides, labels, choice.sides[keeping], choice.exists[keeping])

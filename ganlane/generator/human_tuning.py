@@ -5,6 +5,9 @@ cost that recordings cannot teach, since nobody in them has an accident. Among t
 whom the policy does not drive: slow ones, ones who brake, ones who push in, as an agent may. A pull
 to the cloned policy (the divergence of both) keeps everything else as recorded, and a penalty keeps
 the rate of lane changes, which carries over between roads per second rather than per kilometre.
+
+One iteration: :func:`random_scenes`, :func:`drive` for T decisions of N scenes with M vehicles,
+:func:`costs` of each decision, :func:`advantages`, and two passes over them in :func:`tune`.
 """
 
 from __future__ import annotations
@@ -93,28 +96,50 @@ class Strangers(NamedTuple):
 
     def choices(self, choice: LaneChoice, wish: Tensor, side: Tensor) -> Tensor:
         """A lane choice [N, M] (:func:`with_choice`) where a uniform ``wish`` asks for one; to the
-        left where ``side`` is below one half.
+        left where the uniform ``side`` is below one half.
         """
+        # On the left and on the right, [N, M, 2].
         room = leaves_room(choice.sides, PUSHING_ROOM_M, PUSHING_BRAKING) & choice.exists
-        first = torch.where(side < 0.5, 1, 2)
-        can = room.gather(-1, (first - 1)[..., None])[..., 0]
-        return torch.where((wish < PUSHING) & can & choice.keeping, first, 0)
+        to_left = side < 0.5
+        can = torch.where(to_left, room[..., 0], room[..., 1])
+        pushes_in = (wish < PUSHING) & can & choice.keeping
+        return torch.where(pushes_in, torch.where(to_left, 1, 2), 0)
 
     def moves(self, vehicles: Vehicles, road: Road) -> tuple[Tensor, Tensor]:
-        """Accelerations, m/s2, and lateral speeds, m/s: IDM behind others, at their own pace."""
+        """Accelerations, m/s2, and lateral speeds, m/s, [N, M]: IDM behind others, at their own
+        pace.
+        """
         unlimited = vehicles.with_(desired_speed=torch.full_like(self.pace, NO_LIMIT_MPS))
         behind = following_acceleration(scene_of(unlimited, road), TABLE_V)
+
+        # To their pace, but no faster than the ones ahead allow.
         to_pace = (self.pace - vehicles.speed) / STRANGER_S
-        acceleration = torch.minimum(behind, torch.maximum(to_pace, -self.braking))
+        to_pace = torch.maximum(to_pace, -self.braking)
+        acceleration = torch.minimum(behind, to_pace)
         acceleration = acceleration.clamp(HARDEST_BRAKING, STRANGER_ACCELERATION)
-        stops = -vehicles.speed / DECISION_S
+        # At most to a stop.
+        acceleration = torch.maximum(acceleration, -vehicles.speed / DECISION_S)
+
         target = road.centre_of(vehicles.target_lane, vehicles.y.dtype)
         aside = ((target - vehicles.y) / PUSHING_S).clamp(-PUSHING_MPS, PUSHING_MPS)
-        return torch.maximum(acceleration, stops), aside
+        return acceleration, aside
 
 
 class Decisions(NamedTuple):
-    """Decisions of all drivers, [T, N, M, ...]: what they saw, did, and what it cost."""
+    """Decisions of all drivers, [T, N, M, ...]: what they saw, did, and what it cost.
+
+    Attributes:
+        features: of the next move, [..., FEATURES].
+        sides, exists, keeping, to_left: the lane choice, as in
+            :class:`~ganlane.generator.human.LaneChoice`.
+        speed: m/s.
+        actions: tokens along and across, lane choice, [..., 3].
+        log_chance: logarithm of their probability when they were drawn.
+        value: the critic's estimate of the return; a reward is a cost with its sign changed.
+        cost: of the decision.
+        valid: whether the decision counts; strangers' do not.
+        goes_on: whether the driver is still there at the next one.
+    """
 
     features: Tensor
     sides: Tensor
@@ -156,6 +181,8 @@ def tune(
         danger: sides to which nobody changes, [D, SIDE_FEATURES].
         iterations: of driving and learning.
         pull: weight of the divergence from what it is now.
+        random: draws scenes, moves and batches.
+        report: called with the cost after every iteration.
     """
     reference = deepcopy(policy).requires_grad_(False)
     critic = layers(FEATURES + 2 * SIDE_FEATURES, 64, 64, 1)
@@ -167,30 +194,40 @@ def tune(
     )
     # Recordings without a lane change say nothing about their rate.
     recorded = begins_per_decision(teacher) if teacher is not None else 0.0
+
     for number in range(iterations):
         # A warm-up of five iterations, then linearly down to a fifth.
-        rise, fall = min(1.0, (number + 1) / 5), 1.0 - 0.8 * number / iterations
+        rise = min(1.0, (number + 1) / 5)
+        fall = 1.0 - 0.8 * number / iterations
         optimizer.param_groups[0]["lr"] = RATE * rise * fall
+
+        # The policy's decisions one below the other, [R, ...], and what they were worth, [R].
         decisions = drive(policy, critic, random)
         advantage, wanted = advantages(decisions)
         flat = decisions.rows(decisions.valid)
         advantage, wanted = advantage[decisions.valid], wanted[decisions.valid]
         advantage = (advantage - advantage.mean()) / (advantage.std() + 0.01)
+
         for _ in range(PASSES):
             for rows in torch.randperm(len(wanted), generator=random).split(BATCH):
                 part = flat.rows(rows)
                 loss = _policy_loss(policy, reference, part, advantage[rows], pull)
+
                 values = _values(critic, part.features, part.sides)
                 loss = loss + smooth_l1_loss(values, wanted[rows])
+
                 if teacher is not None and recorded > 0.0:
                     off = _rate_loss(policy, part, teacher, recorded, random)
                     loss = loss + RATE_PULL * off
+
                 # Nobody begins a change into danger, and who is in one breaks it off.
-                shown = danger[torch.randint(len(danger), (512,), generator=random)]
-                lane = policy.lane(shown)
-                loss = loss + RATE_PULL * softplus(lane[:, 0] + 10.0).mean()
-                loss = loss + 0.2 * RATE_PULL * softplus(-lane[:, 1]).mean()
+                rows_of_danger = torch.randint(len(danger), (512,), generator=random)
+                to_begin, to_stop = policy.lane(danger[rows_of_danger]).unbind(-1)
+                loss = loss + RATE_PULL * softplus(to_begin + 10.0).mean()
+                loss = loss + 0.2 * RATE_PULL * softplus(-to_stop).mean()
+
                 descend(optimizer, loss, 1.0)
+
         report(float(decisions.cost.sum()) / float(decisions.valid.sum()))
 
 
@@ -200,13 +237,17 @@ def begins_per_decision(teacher: Choices) -> float:
 
 
 def _values(critic: nn.Module, features: Tensor, sides: Tensor) -> Tensor:
+    """The critic's values [...] of features [..., FEATURES] and sides [..., 2, SIDE_FEATURES]."""
     return critic(torch.cat((features, sides.flatten(-2)), -1))[..., 0]
 
 
 def advantages(decisions: Decisions) -> tuple[Tensor, Tensor]:
-    """Advantages and values to learn, [T, N, M] (generalised advantage estimation)."""
+    """Advantages and values to learn, [T, N, M]: generalised advantage estimation (Schulman et al.
+    2016, equation 16).
+    """
     reward, value = -decisions.cost, decisions.value
     advantage = torch.zeros_like(reward)
+    # The last decision is taken to be followed by one of its own value.
     following = value[-1]
     last = torch.zeros_like(following)
     # Backwards in time: an advantage holds the errors that follow, discounted.
@@ -220,7 +261,9 @@ def advantages(decisions: Decisions) -> tuple[Tensor, Tensor]:
 
 
 def _log_chances(policy: HumanPolicy, features: Tensor, choice: LaneChoice) -> tuple[Tensor, ...]:
-    """Logarithms of the chances of all tokens along and across, and of all lane choices."""
+    """Logarithms of the chances of all tokens along [..., 41] and across [..., 31], and of all lane
+    choices [..., 3].
+    """
     along, across = policy(features)
     return (
         torch.log_softmax(along / TEMPERATURE, -1),
@@ -231,7 +274,10 @@ def _log_chances(policy: HumanPolicy, features: Tensor, choice: LaneChoice) -> t
 
 def _of_actions(chances: tuple[Tensor, ...], actions: Tensor) -> Tensor:
     """Logarithm of the chance of the ``actions`` [..., 3]: tokens along and across, lane choice."""
-    taken = [log.gather(-1, actions[..., [kind]])[..., 0] for kind, log in enumerate(chances)]
+    taken = []
+    for log_chances, action in zip(chances, actions.unbind(-1)):
+        taken.append(log_chances.gather(-1, action[..., None])[..., 0])
+    # A product of chances: both tokens are drawn after the lane choice, each for itself.
     return torch.stack(taken).sum(0)
 
 
@@ -242,16 +288,25 @@ def _policy_loss(
     advantage: Tensor,
     pull: float,
 ) -> Tensor:
-    """The clipped objective, and the divergence from the reference."""
-    chances = _log_chances(policy, decisions.features, decisions.choice)
-    log_chance = _of_actions(chances, decisions.actions)
+    """The clipped objective (Schulman et al. 2017, equation 7), and the divergence from the
+    reference.
+    """
+    log_chances = _log_chances(policy, decisions.features, decisions.choice)
+    log_chance = _of_actions(log_chances, decisions.actions)
+
+    # By how much likelier the actions are now than when they were drawn.
     ratio = torch.exp((log_chance - decisions.log_chance).clamp(-5.0, 5.0))
     bounded_ratio = ratio.clamp(1.0 - RATIO, 1.0 + RATIO)
     gain = torch.minimum(ratio * advantage, bounded_ratio * advantage).mean()
+
+    # Kullback-Leibler divergences along, across and of the lane choice.
     with torch.no_grad():
-        theirs = _log_chances(reference, decisions.features, decisions.choice)
-    apart = [(mine.exp() * (mine - other)).sum(-1).mean() for mine, other in zip(chances, theirs)]
-    return -gain + pull * (apart[0] + apart[1]) + LANE_PULL * apart[2]
+        of_reference = _log_chances(reference, decisions.features, decisions.choice)
+    apart = []
+    for now, before in zip(log_chances, of_reference):
+        apart.append((now.exp() * (now - before)).sum(-1).mean())
+    along, across, lane = apart
+    return -gain + pull * (along + across) + LANE_PULL * lane
 
 
 def _rate_loss(
@@ -261,49 +316,59 @@ def _rate_loss(
     recorded: float,
     random: torch.Generator,
 ) -> Tensor:
-    """How far lane changes are from the recorded rate: at all speeds, and where recorded."""
-    chances = policy.lane_chances(decisions.choice)
-    begins = chances[:, 1] + chances[:, 2]
+    """How far lane changes are from the ``recorded`` rate per decision: at all speeds in
+    simulation, and in recorded states. Squares of the logarithm of the ratio.
+    """
+    # Whoever is in its lane: the chance to begin a change to the left or to the right.
+    _, left, right = policy.lane_chances(decisions.choice).unbind(-1)
+    begins = left + right
     loss = torch.zeros(())
     for low, high in BANDS_MPS:
         here = (decisions.speed >= low) & (decisions.speed < high) & decisions.keeping
+        # A rate of fewer decisions says little.
         if int(here.sum()) > 200:
             loss = loss + torch.log(begins[here].mean() / recorded).square() / len(BANDS_MPS)
+
     rows = torch.randint(len(teacher.keeping_sides), (8192,), generator=random)
-    chances = policy.lane_chances(teacher.keeping(rows))
-    return loss + torch.log((chances[:, 1] + chances[:, 2]).mean() / recorded).square()
+    _, left, right = policy.lane_chances(teacher.keeping(rows)).unbind(-1)
+    return loss + torch.log((left + right).mean() / recorded).square()
 
 
 @torch.no_grad()
 def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> Decisions:
-    """Decisions [T, N, M] in random scenes."""
+    """Decisions [T, N, M] of :data:`DECISIONS` steps in random scenes."""
     vehicles, memory, road, strangers = random_scenes(random)
     rand, _ = draws(vehicles.x.shape, random)
     steps: list[Decisions] = []
     for _ in range(DECISIONS):
+        # Lane choices.
         situation = situation_of(vehicles, memory, road)
         choice = lane_choice(situation)
         lane = _drawn(policy.lane_chances(choice), random)
-        others = strangers.choices(choice, rand(), rand())
-        lane = torch.where(strangers.there, others, lane)
+        strangers_lane = strangers.choices(choice, rand(), rand())
+        lane = torch.where(strangers.there, strangers_lane, lane)
         situation = with_choice(situation, lane)
         vehicles, view = situation.vehicles, situation.view
-        # The moves follow the choice.
+
+        # The moves follow the choice: a token, and a place within it that nobody learns from.
         features = features_of(situation)
         tokens, changes = [], []
         for axis, logits in zip((ALONG, ACROSS), policy(features)):
             token = _drawn(torch.softmax(logits / TEMPERATURE, -1), random)
             tokens.append(token)
-            changes.append(axis.value(token + (rand() - 0.5)))
+            within = rand() - 0.5
+            changes.append(axis.value(token + within))
         acceleration, aside = bounded(situation, *changes)
-        theirs = strangers.moves(vehicles, road)
-        acceleration = torch.where(strangers.there, theirs[0], acceleration)
-        aside = torch.where(strangers.there, theirs[1], aside)
+        strangers_acceleration, strangers_aside = strangers.moves(vehicles, road)
+        acceleration = torch.where(strangers.there, strangers_acceleration, acceleration)
+        aside = torch.where(strangers.there, strangers_aside, aside)
+
         memory = remembered(situation, acceleration)
         later = moved(vehicles, acceleration, aside)
         cost, hit = costs(later, road, view.gap)
         # Who has collided leaves the scene.
         goes_on = vehicles.valid & ~hit
+
         actions = torch.stack((*tokens, lane), -1)
         decisions = Decisions(
             features=features,
@@ -323,7 +388,8 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
 
 def _drawn(chances: Tensor, random: torch.Generator) -> Tensor:
     """Numbers [N, M] below K, drawn by their ``chances`` [N, M, K]."""
-    return torch.multinomial(chances.flatten(0, 1), 1, generator=random).view(chances.shape[:-1])
+    drawn = torch.multinomial(chances.flatten(0, 1), 1, generator=random)
+    return drawn.view(chances.shape[:-1])
 
 
 def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor]:
@@ -334,25 +400,29 @@ def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor]:
     speed, lateral = velocity(vehicles)
 
     # Pairs [N, M, M]: the last index is the other vehicle.
+    # Gaps of their bodies along the road and across it are below 0 where they overlap, m.
     along, bumpers, order = compare(vehicles, road)
-    across = vehicles.y[:, None, :] - vehicles.y[:, :, None]
-    mean_width = 0.5 * (vehicles.width[:, None, :] + vehicles.width[:, :, None])
+    across = vehicles.y[:, None] - vehicles.y[..., None]
+    mean_width = 0.5 * (vehicles.width[:, None] + vehicles.width[..., None])
     sides = across.abs() - mean_width
     # Nobody is a pair with itself.
-    both = vehicles.valid[:, :, None] & vehicles.valid[:, None, :] & (order != 0)
-    # Bodies count as touching a little before they do.
+    both = vehicles.valid[..., None] & vehicles.valid[:, None] & (order != 0)
+
+    # Accidents. Bodies count as touching a little before they do.
     touches = both & (bumpers < 0.2) & (sides < 0.05)
     # To blame are the one behind, and the one who moves, or has moved, towards the other.
     towards = torch.sign(across)
     off_target = vehicles.y - road.centre_of(vehicles.target_lane, lateral.dtype)
-    sideways = (lateral[:, :, None] * towards > 0.15) | (off_target[:, :, None] * towards > 0.6)
+    moves_aside = lateral[..., None] * towards > 0.15
+    has_moved_aside = off_target[..., None] * towards > 0.6
+    sideways = moves_aside | has_moved_aside
     behind = (along > 0) & (sides < -0.4)
     blame = touches & (sideways | behind)
     hit = touches.any(-1)
-    cost = 5.0 * blame.any(-1) + 1.0 * hit
+    cost = 5.0 * blame.any(-1) + hit
 
     # Close calls: a time to collision below 1.5 s, a gap below 0.25 s, sides within 0.35 m.
-    closing = speed[:, :, None] - speed[:, None, :]
+    closing = speed[..., None] - speed[:, None]
     ahead = both & (along > 0) & (sides < 0.15) & (bumpers > 0)
     time_s = torch.where(ahead & (closing > 0.1), bumpers / closing.clamp_min(0.1), 99.0).amin(-1)
     nearest = torch.where(ahead, bumpers, 99.0).amin(-1)
@@ -361,15 +431,15 @@ def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor]:
     beside = both & (bumpers < 0.5) & (sides < 0.35) & (sides >= 0.05) & sideways
     cost = cost + 0.15 * beside.any(-1)
 
-    # The edges of the road, for the turned body.
+    # The edges of the road, for the turned body: by how much it is beyond one, m, and 0.25 m early.
     turned = (lateral.abs() / speed.clamp_min(2.0)).clamp_max(0.3)
     half = 0.5 * vehicles.width + 0.5 * vehicles.length * turned
-    beyond = torch.maximum(
-        road.right_edge_m() - (vehicles.y - half), vehicles.y + half - road.left_edge_m()
-    )
-    cost = cost + 3.0 * (beyond > 0) + 1.0 * (beyond + 0.25).clamp(0.0, 1.0)
+    beyond_right = road.right_edge_m() - (vehicles.y - half)
+    beyond_left = vehicles.y + half - road.left_edge_m()
+    beyond = torch.maximum(beyond_right, beyond_left)
+    cost = cost + 3.0 * (beyond > 0) + (beyond + 0.25).clamp(0.0, 1.0)
 
-    # Nobody stands or crawls where the road is free.
+    # Nobody stands or crawls where the road is free, or is slower than three quarters of its wish.
     cost = cost + 0.3 * ((speed < 3.0) & (gap > 40.0))
     slow = (0.75 - speed / vehicles.desired_speed).clamp(0.0, 0.5)
     cost = cost + 0.05 * slow * (gap > 80.0)
@@ -380,25 +450,38 @@ def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road, Stra
     """Scenes of 2 to 5 lanes, 3 to 28 m/s, people's headways, dense and sparse; in some of them
     some of the vehicles are strangers.
     """
+    # Numbers of vehicles [N, M] and of scenes [N, 1]; the order of the draws is part of a fit.
     shape = (SCENES, VEHICLES)
     rand, randn = draws(shape, random)
+    rand_of_scene, _ = draws((SCENES, 1), random)
+
+    # Four in ten scenes have three lanes, the others 2 to 5; lanes are 3.3 to 4.1 m wide.
     lanes = torch.randint(2, 6, (SCENES, 1), generator=random).float()
-    lanes = torch.where(rand(SCENES, 1) < 0.4, 3.0, lanes)
-    road = Road(lanes, 3.3 + 0.8 * rand(SCENES, 1))
+    lanes = torch.where(rand_of_scene() < 0.4, 3.0, lanes)
+    road = Road(lanes, 3.3 + 0.8 * rand_of_scene())
     lane = (rand() * lanes).floor()
-    of_lane = 3.0 + 25.0 * rand(SCENES, 1) + 1.5 * randn(SCENES, 6)
+
+    # Speeds, m/s: of the scene, of the lane, of the vehicle.
+    of_lane = 3.0 + 25.0 * rand_of_scene() + 1.5 * randn(SCENES, 6)
     speed = (of_lane.gather(1, lane.long()) + 0.8 * randn()).clamp(0.5, 34.0)
-    sparse = torch.where(rand(SCENES, 1) < 0.5, 1.0, 1.0 + 4.0 * rand(SCENES, 1))
+
+    # From one vehicle to the next, m; headways in s are up to five times as long in half of the
+    # scenes. Six in a hundred are lorries.
+    sparse = torch.where(rand_of_scene() < 0.5, 1.0, 1.0 + 4.0 * rand_of_scene())
     length = torch.where(rand() < 0.06, 12.0, 4.2 + 0.8 * rand())
     headway = torch.exp(math.log(1.3) + 0.45 * randn()).clamp(0.6, 5.0) * sparse
     space = headway * speed + 3.0 + length
-    x = torch.zeros(shape)
-    for number in range(5):  # one behind another in each lane
-        here = lane == number
-        behind = -(space * here).cumsum(1) - 30.0 * rand(SCENES, 1)
-        x = torch.where(here, behind, x)
-    desired = torch.where(rand(SCENES, 1) < 0.5, speed + 10.0 * rand(), 18.0 + 8.0 * rand())
+
+    # Fronts, m: one behind another in each lane.
     zero = torch.zeros(shape)
+    x = zero
+    for number in range(5):
+        here = lane == number
+        behind = -(space * here).cumsum(1) - 30.0 * rand_of_scene()
+        x = torch.where(here, behind, x)
+
+    # In half of the scenes the present speed and up to 10 m/s more, in the others 18 to 26 m/s.
+    desired = torch.where(rand_of_scene() < 0.5, speed + 10.0 * rand(), 18.0 + 8.0 * rand())
     vehicles = cars(
         x - 0.5 * length,
         lane * road.lane_width_m + 0.25 * randn().clamp(-2.0, 2.0),
@@ -411,10 +494,12 @@ def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road, Stra
         target_lane=lane.long(),
     )
     memory = entering_memory(vehicles, road, randn())
+
     # Half of the strangers are slow, some brake hard.
-    there = (rand() < STRANGERS) & (rand(SCENES, 1) < WITH_STRANGERS)
+    there = (rand() < STRANGERS) & (rand_of_scene() < WITH_STRANGERS)
     pace = torch.where(rand() < 0.5, 8.0 * rand(), 8.0 + 20.0 * rand())
-    return vehicles, memory, road, Strangers(there, pace, 1.0 + 4.0 * rand())
+    braking = 1.0 + 4.0 * rand()
+    return vehicles, memory, road, Strangers(there, pace, braking)
 
 
 def entering_memory(vehicles: Vehicles, road: Road, drawn: Tensor) -> Memory:
@@ -424,9 +509,12 @@ def entering_memory(vehicles: Vehicles, road: Road, drawn: Tensor) -> Memory:
     numbers ``drawn`` [N, M]: 1.4 s in the middle, spread by a third.
     """
     view = perceive(vehicles, road)
+
+    # Neither accelerations nor changes of the lateral speed so far.
     steady = vehicles.x.new_zeros(*vehicles.x.shape, ACCELERATIONS)
     lateral_speeds = torch.stack((view.aside, view.aside), -1)
     memory = memory_of(steady, lateral_speeds, torch.zeros_like(vehicles.x))
+
     free = view.log_headway.isnan()
     log_headway = torch.where(free, math.log(1.4) + 0.35 * drawn, view.log_headway)
     view = view._replace(log_headway=log_headway)

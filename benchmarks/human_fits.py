@@ -32,16 +32,13 @@ from ganlane.data.one_lane import one_lane_files, read_one_lane
 from ganlane.evaluation.table import Table, with_interval
 from ganlane.generator import load_generator, shipped_generator
 from ganlane.generator.checkpoint import load_human
-from ganlane.generator.fit import LONG_STEPS
+from ganlane.generator.fit import LONG_STEPS, errors_beside_references
 from ganlane.generator.forecasts import (
     BASELINE,
     calibrated_driver,
     displacement_errors,
     driven_windows,
-    errors_of,
-    idm_driver,
     long_errors,
-    repeated,
 )
 from ganlane.generator.human_forecasts import human_driver
 from ganlane.generator.windows import OBSERVED_POSITIONS, PREDICTED_STEPS, cut_windows
@@ -71,15 +68,14 @@ def sites(weights: Path) -> str:
             drivers = {
                 "human": human_driver(policy, 0),
                 "gan_calibrated": calibrated_driver(calibrated, CalibratedConfig(), 0),
-                "idm": idm_driver,
             }
-            forecasts = {BASELINE: repeated(windows.past[:, -1], steps)}
-            for kind, driver in drivers.items():
-                (forecasts[kind],) = driven_windows(driver, scenes, steps, stride)
+            forecasts = {
+                kind: driven_windows(driver, scenes, steps, stride)[0]
+                for kind, driver in drivers.items()
+            }
+            all_errors = errors_beside_references(forecasts, windows, scenes, stride)
             rows = [driven[scene][car] for scene, car in zip(windows.scene, windows.vehicle)]
-            errors = {
-                kind: values[rows] for kind, values in errors_of(forecasts, windows.future).items()
-            }
+            errors = {kind: values[rows] for kind, values in all_errors.items()}
             if steps == PREDICTED_STEPS:
                 scores = displacement_errors(errors)["ade_m"]
             else:

@@ -280,7 +280,8 @@ def reading_of(metadata: Mapping[str, Any]) -> Reading:
         scale = metadata["observation_scale"]
         observation = ObservationConfig(form=metadata["observation"], **scale)
         mask = MaskParameters(**metadata["mask"])
-        actions = make(ActionParameters, metadata.get("env", {}).get("actions", {}))
+        env = metadata.get("env") or {}
+        actions = make(ActionParameters, env.get("actions") or {})
     except (KeyError, TypeError, AttributeError, ParameterError) as error:
         raise UserError(
             "the agent's metadata name no observation, mask and actions that are known here "

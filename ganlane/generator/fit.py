@@ -38,6 +38,7 @@ from ganlane.generator.tasks import CalibratedTask, HumanTask, OnProgress, Paper
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
     PREDICTED_STEPS,
+    Windows,
     count_windows,
     cut_windows,
 )
@@ -264,9 +265,21 @@ def held_out_errors(task: Task, scenes: list[Recording], steps: int, stride: int
     windows = cut_windows(scenes, stride, OBSERVED_POSITIONS + steps)
     samples = task.forecasts(scenes, steps, stride, 1 if few else SAMPLES)
     forecasts = by_kind(samples, windows.future)
-    forecasts[BASELINE] = repeated(windows.past[:, -1], steps)
-    (forecasts["idm_own_headway"],) = driven_windows(idm_driver, scenes, steps, stride)
-    return windows.scene, errors_of(forecasts, windows.future)
+    return windows.scene, errors_beside_references(forecasts, windows, scenes, stride)
+
+
+def errors_beside_references(
+    forecasts: Forecasts, windows: Windows, scenes: list[Recording], stride: int
+) -> Forecasts:
+    """Errors of ``forecasts`` of all ``windows`` of the ``scenes``, of constant velocity's and of
+    IDM's with each driver's own headway.
+    """
+    steps = windows.future.shape[1]
+    references = {
+        BASELINE: repeated(windows.past[:, -1], steps),
+        "idm_own_headway": driven_windows(idm_driver, scenes, steps, stride)[0],
+    }
+    return errors_of({**forecasts, **references}, windows.future)
 
 
 def errors_by_scene(held: HeldOut) -> dict[str, Any]:

@@ -105,7 +105,10 @@ def test_paper_experiment_is_two_phases_and_can_be_shortened():
 
 def test_yaml_files_explain_themselves():
     for path in conf_folder().rglob("*.yaml"):
-        assert path.read_text().startswith("# "), path
+        first = next(
+            line for line in path.read_text().splitlines() if not line.startswith("# @package")
+        )
+        assert first.startswith("# "), path
         assert OmegaConf.load(path) is not None
 
 

@@ -41,7 +41,7 @@ INFO: Final[dict[str, Key]] = {
 #: Its name of the allowed actions.
 ACTION_MASK: Final = "action_mask"
 #: Parts of the info that are no number per row.
-_NO_NUMBERS: Final = (ACTION_MASK, keys.REWARD_TERMS)
+NO_NUMBERS: Final = (ACTION_MASK, keys.REWARD_TERMS)
 
 
 class Rows(ABC):
@@ -105,8 +105,11 @@ class Rows(ABC):
         """An array [N] of the state (:mod:`ganlane.keys`), of ``vehicles`` the ego's."""
 
     @abstractmethod
-    def lanes(self) -> tuple[Any, Any]:
-        """The road's number of lanes and their width in m, each perhaps one number for all rows."""
+    def driven(self) -> tuple[npt.NDArray[np.float64], Integers]:
+        """Time since the start of the episode in s, and the lane that the ego is in, each [N].
+
+        An ego that has left the road is in the outer lane.
+        """
 
     @abstractmethod
     def reward_terms(self) -> dict[str, Array]:
@@ -120,32 +123,16 @@ class Rows(ABC):
     def info(self) -> dict[str, Any]:
         """Gymnasium's info (docs/gymnasium.md) as arrays [N] by name; valid until the next call."""
         info: dict[str, Any] = {name: self.array(key) for name, key in INFO.items()}
-        info["time_s"] = np.empty(self.count)
-        info["lane"] = np.empty(self.count, np.int64)
+        info["time_s"], info["lane"] = self.driven()
         # gymnasium's Discrete.sample() takes masks of int8; the bytes of booleans are the same.
         if self.actions.names:
             info[ACTION_MASK] = self.mask().view(np.int8)
         info[keys.REWARD_TERMS] = self.reward_terms()
-        measure(info, *self.driven())
         return info
 
     def first_info(self) -> dict[str, Any]:
         """The info of the first row, with Python's numbers; valid for good."""
         return row_of(self.info(), 0)
-
-    def driven(self) -> tuple[Any, ...]:
-        """What :func:`measure` reads: physics steps, the ego's y in m, and :meth:`lanes`."""
-        return self.array(keys.STEP), self.array((keys.VEHICLES, "y")), *self.lanes()
-
-
-def measure(info: Mapping[str, Any], step: Integers, y: Array, lanes: Any, width_m: Any) -> None:
-    """Write the info's time in s and the ego's lane."""
-    # Simulated time is counted in physics steps, so it has no sum of rounding errors.
-    np.multiply(step, keys.PHYSICS_STEP_S, out=info["time_s"])
-    # The road's own rounding, in the run's float type.
-    lane = np.rint(y / np.asarray(width_m, y.dtype))
-    # An ego that has left the road is beyond the outer lanes.
-    info["lane"][:] = np.minimum(np.maximum(lane, 0.0), lanes - 1)
 
 
 def observation_space(size: int, largest: float) -> Box:
@@ -165,7 +152,7 @@ def row_of(info: Mapping[str, Any], row: int) -> dict[str, Any]:
     """One row of :meth:`Rows.info`, numbers as Python's."""
     # Of the numbers by a plain loop over methods: with a test of every value it took half as long
     # again.
-    values = {name: value.item(row) for name, value in info.items() if name not in _NO_NUMBERS}
+    values = {name: value.item(row) for name, value in info.items() if name not in NO_NUMBERS}
     # A copy, since arrays are views of what the next step overwrites.
     if ACTION_MASK in info:
         values[ACTION_MASK] = info[ACTION_MASK][row].copy()
@@ -217,14 +204,17 @@ def actions_of(commanded: Any, rows: int, actions: ActionParameters) -> Integers
                 "acceleration and lateral target; give both for every environment."
             )
         return array.astype(np.float32, copy=False)
+    numbers = None
     # Before any cast, which would round and wrap.
-    whole = array.shape == (rows,) and array.dtype.kind in "iu"
-    if not whole or not 0 <= array.min() <= array.max() < len(actions.names):
+    if array.shape == (rows,) and array.dtype.kind in "iu":
+        numbers = array.astype(np.int64, copy=False)
+    # As unsigned numbers those below 0 are above all others: one search in place of two.
+    if numbers is None or numbers.view(np.uint64).max() >= len(actions.names):
         raise UserError(
             f"action {commanded!r:.80}: expected {rows} whole number(s), "
             f"{actions.meanings()}; give one for every environment."
         )
-    return array.astype(np.int64, copy=False)
+    return numbers
 
 
 def reset_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dict[str, Any]:

@@ -105,12 +105,19 @@ class TensorRows(Rows):
         # The ego is the first vehicle; events have the shape [N, 1].
         return array[:, EGO_INDEX] if array.ndim > 1 else array
 
-    def lanes(self) -> tuple[Any, Any]:
+    def driven(self) -> tuple[npt.NDArray[np.float64], Integers]:
+        # Counted in physics steps, so that it has no sum of rounding errors.
+        time_s = self.array(keys.STEP) * keys.PHYSICS_STEP_S
         road = self._road()
         # One number for all rows, or [N, 1].
-        lanes = torch.as_tensor(road.lanes)
-        width_m = torch.as_tensor(road.lane_width_m)
-        return _array(lanes.flatten()), _array(width_m.flatten())
+        lanes, width_m = (
+            _array(torch.as_tensor(number).flatten()) for number in (road.lanes, road.lane_width_m)
+        )
+        y = self.array((keys.VEHICLES, "y"))
+        # The road's own rounding, in the run's float type.
+        lane = np.rint(y / width_m.astype(y.dtype))
+        lane = np.minimum(np.maximum(lane, 0.0), lanes - 1)
+        return time_s, lane.astype(np.int64)
 
     def _road(self) -> Road:
         """The road of the rows: of their recorded scenes, else that of the settings."""

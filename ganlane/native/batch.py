@@ -63,7 +63,7 @@ class _Batch(settings.Structure):
         *fields(
             ctypes.c_void_p,
             "settings inputs outputs spawn scene reward_settings reward terms view view_inputs"
-            " observation mask_settings mask_inputs mask_outputs mask speed_mask",
+            " observation mask_settings mask_inputs mask_outputs mask speed_mask time_s lane",
         ),
         *fields(ctypes.c_float, "lowest highest fastest"),
         *fields(ctypes.c_int32, "vehicles lanes size mask_form abort_lane_change"),
@@ -116,6 +116,8 @@ class NativeBatch:
     Attributes:
         state: the environment's state (:mod:`ganlane.keys`) as arrays by key, ``("vehicles", "x")``
             [N, M], ``("ego", "distance")`` and the rest [N].
+        time_s: since the start of the episode [N].
+        lane: that the ego is in [N], from 0 at the right.
 
     Raises:
         UserError: the kernel cannot be built here.
@@ -183,6 +185,8 @@ class NativeBatch:
         if actions.form != LANE:
             self.mask = np.ones((rows, len(actions.names)), np.bool_)
         self._no_safe_action = np.zeros(rows, np.bool_)
+        self.time_s = np.zeros(rows)
+        self.lane = np.zeros(rows, np.int64)
 
         # [N, terms], and a view of the first row.
         self._term_values = np.zeros((rows, len(self.terms)), np.float32)
@@ -209,6 +213,8 @@ class NativeBatch:
             "observation": self.observation,
             "mask": self._lane_mask,
             "speed_mask": self.mask if self._highway.actions.form == LANE_SPEED else None,
+            "time_s": self.time_s,
+            "lane": self.lane,
             "lowest": self.bounds[0],
             "highest": self.bounds[1],
             "fastest": SPEED_RATIO_LIMIT,
@@ -266,7 +272,8 @@ class NativeBatch:
 
     def _arrays(self) -> list[Array]:
         """All that changes from step to step."""
-        return [*self.state.values(), self.observation, self.mask, self._term_values]
+        arrays = [self.observation, self.mask, self._term_values, self.time_s, self.lane]
+        return [*self.state.values(), *arrays]
 
     def _pointers(
         self, names: Iterable[Key], rows: Array | None = None
@@ -278,27 +285,28 @@ class NativeBatch:
         arrays: dict[Key, Any] = {**self.state, "rows": rows}
         return addresses([arrays.get(name) for name in names])
 
-    def start(
-        self, seed: npt.ArrayLike, episode: npt.ArrayLike, rows: npt.NDArray[np.bool_] | None = None
-    ) -> None:
-        """Begin episodes.
+    def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
+        """Begin episodes in all rows.
 
         Args:
             seed, episode: whole numbers, [N], or one for all rows.
-            rows: flags [N] of those to start; None: all.
         """
-        state = self.state
-        # The kernel starts the rows whose flag is set and leaves the others alone.
-        fresh = state["fresh"]
-        fresh[:] = True if rows is None else rows
-        np.copyto(state[keys.SEED], seed, where=fresh)
-        np.copyto(state[keys.EPISODE], episode, where=fresh)
+        self.state[keys.SEED][:] = seed
+        self.state[keys.EPISODE][:] = episode
+        self._start(np.ones(self.rows, np.bool_))
 
-        # Of several parts each starts its own rows.
-        starting = fresh.copy()
+    def restart(self, rows: npt.NDArray[np.bool_]) -> None:
+        """Begin the next episode, number n + N after n, in the rows where ``rows`` [N] is true."""
+        episode = self.state[keys.EPISODE]
+        np.add(episode, self.rows, out=episode, where=rows)
+        self._start(rows)
+
+    def _start(self, rows: npt.NDArray[np.bool_]) -> None:
+        # The kernel starts the rows whose flag is set and leaves the others alone.
+        fresh = self.state["fresh"]
         for number, part in enumerate(self._parts):
-            if part.rows is not None:
-                fresh[:] = starting & (self._part_of_row() == number)
+            # Of several parts each starts its own rows.
+            fresh[:] = rows if part.rows is None else rows & (self._part_of_row() == number)
             part.call(self._library.ganlane_start, self.rows)
 
     def _part_of_row(self) -> npt.NDArray[np.int64]:

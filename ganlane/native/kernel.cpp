@@ -563,6 +563,7 @@ extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const 
             long at = place + (lane < block.count ? lane : block.count - 1);
             block.row[lane] = in->rows ? (long)in->rows[at] : at;
         }
+        r.alone = block.count == 1;
         load(s, *in, r, block, commands);
         load_fields(fields, r, memory_of(in), block);
         crowd.environments = (int)block.count;

@@ -42,6 +42,8 @@ struct Batch {
     const MaskOutputs* mask_outputs;
     uint8_t* mask;       // [rows, 3]
     uint8_t* speed_mask;  // [rows, 5], with faster and slower; null: there are no such actions
+    double* time_s;       // [rows], since the episode's start
+    int64_t* lane;        // [rows], that the ego is in; beyond the outer ones the outer one
     float lowest, highest, fastest;  // bounds of the observation; the last one is that of its first number
     int32_t vehicles, lanes, size, mask_form, abort_lane_change;
 };
@@ -83,7 +85,15 @@ static void allow_speeds(const Batch& b, long row) {
     mask[4] = speed > b.settings->actions->lowest_speed;
 }
 
-// Mask and observation of the rows [first, last).
+// Time and the ego's lane.
+static void measure(const Batch& b, long row) {
+    const double STEP_S = 0.1;  // PHYSICS_STEP in double precision
+    b.time_s[row] = (double)b.out->step[row] * STEP_S;
+    float lane = __builtin_rintf(b.out->y[row * b.vehicles] / b.settings->lane_width), outer = (float)(b.lanes - 1);
+    b.lane[row] = (int64_t)(lane < 0.0f ? 0.0f : lane > outer ? outer : lane);
+}
+
+// Mask, observation, time and lane of the rows [first, last).
 static int look(const Batch& b, long first, long last) {
     int failed = ganlane_lane_view(b.view, b.view_inputs, &b.observation, first, last);
     for (long row = first; row < last; row++) {
@@ -93,6 +103,7 @@ static int look(const Batch& b, long first, long last) {
             numbers[i] = numbers[i] < low ? low : numbers[i] > high ? high : numbers[i];
         }
         if (b.mask_form < MASK_SAFE) allow(b, row);
+        measure(b, row);
     }
     if (b.mask_form >= MASK_SAFE) failed |= ganlane_mask(b.mask_settings, b.mask_inputs, b.mask_outputs, first, last);
     if (b.speed_mask)

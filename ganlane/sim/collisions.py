@@ -8,7 +8,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ganlane.sim.state import STRAIGHT, Road, Vehicles, reads_are_cheap
+from ganlane.sim.state import (
+    STRAIGHT,
+    Road,
+    Vehicles,
+    reads_are_cheap,
+)
 
 #: Pairs below which choosing the near ones takes longer than testing all of them. With 1024 rows
 #: a decision of idm_random takes 4 % longer if all are tested.
@@ -31,13 +36,16 @@ def boxes_overlap(dx: Tensor, one: Vehicles, other: Vehicles) -> Tensor:
     cos_other = torch.cos(other.heading)
     sin_other = torch.sin(other.heading)
 
-    # Of the angle between the two boxes. A box is symmetric, so signs do not matter.
+    # Cosine and sine of the angle between the two boxes. A box is symmetric, so signs do not matter.
     cos = (cos_one * cos_other + sin_one * sin_other).abs()
     sin = (cos_one * sin_other - sin_one * cos_other).abs()
     half_sizes = [(0.5 * box.length, 0.5 * box.width) for box in (one, other)]
 
     def separated(
-        along: Tensor, across: Tensor, box: tuple[Tensor, Tensor], against: tuple[Tensor, Tensor]
+        along: Tensor,
+        across: Tensor,
+        box: tuple[Tensor, Tensor],
+        against: tuple[Tensor, Tensor],
     ) -> Tensor:
         """Whether an axis of a box separates it from the other.
 
@@ -53,10 +61,14 @@ def boxes_overlap(dx: Tensor, one: Vehicles, other: Vehicles) -> Tensor:
         return (along.abs() >= reach_along) | (across.abs() >= reach_across)
 
     # The vector between the centres, turned into the axes of the one and of the other box.
-    by_one = separated(dx * cos_one + dy * sin_one, dy * cos_one - dx * sin_one, *half_sizes)
+    along_one = dx * cos_one + dy * sin_one
+    across_one = dy * cos_one - dx * sin_one
+    by_one = separated(along_one, across_one, *half_sizes)
+
     along_other = dx * cos_other + dy * sin_other
     across_other = dy * cos_other - dx * sin_other
     by_other = separated(along_other, across_other, *reversed(half_sizes))
+
     return ~(by_one | by_other)
 
 
@@ -80,7 +92,8 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
             ego = vehicles.part((row, 0))
             near = vehicles.part((row, column + 1))
             hits = boxes_overlap(dx[row, column], ego, near)
-            return torch.zeros_like(both_valid).index_put((row, column), hits) & both_valid
+            hit = torch.zeros_like(both_valid).index_put((row, column), hits)
+            return hit & both_valid
 
     # [N, 1] against [N, M - 1].
     ego = vehicles.columns(slice(0, 1))
@@ -104,7 +117,10 @@ def pair_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
 
 
 def dangerously_close(
-    gap: Tensor, closing_speed: Tensor, ttc_s: float = 1.5, gap_m: float = 2.0
+    gap: Tensor,
+    closing_speed: Tensor,
+    ttc_s: float = 1.5,
+    gap_m: float = 2.0,
 ) -> Tensor:
     """Whether this is a soft crash, elementwise, bool.
 

@@ -95,6 +95,7 @@ def apply_controls(
     # The line, and the lane that it is in: where that is none, the ego's own.
     lane = road.lane_of(ego.y)
     line = (lane + wheel) * road.lane_width_m
+    # Beyond half a lane's width the line is in the lane beside.
     side = (wheel > 0.5).long() - (wheel < -0.5).long()
     side = torch.where(may_change(road, lane.long(), side, ego.x), side, 0)
     target = lane.long() + side

@@ -8,12 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ganlane.sim.state import (
-    STRAIGHT,
-    Road,
-    Vehicles,
-    reads_are_cheap,
-)
+from ganlane.sim.state import STRAIGHT, Road, Vehicles, reads_are_cheap
 
 #: Pairs below which choosing the near ones takes longer than testing all of them. With 1024 rows
 #: a decision of idm_random takes 4 % longer if all are tested.
@@ -36,7 +31,7 @@ def boxes_overlap(dx: Tensor, one: Vehicles, other: Vehicles) -> Tensor:
     cos_other = torch.cos(other.heading)
     sin_other = torch.sin(other.heading)
 
-    # Cosine and sine of the angle between the two boxes. A box is symmetric, so signs do not matter.
+    # Of the angle between the two boxes. A box is symmetric, so signs do not matter.
     cos = (cos_one * cos_other + sin_one * sin_other).abs()
     sin = (cos_one * sin_other - sin_one * cos_other).abs()
     half_sizes = [(0.5 * box.length, 0.5 * box.width) for box in (one, other)]

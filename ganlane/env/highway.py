@@ -65,9 +65,11 @@ class HighwayEnv(EnvBase):
         traffic: moves the other vehicles; its road is the environment's.
         num_envs: N, the batch size.
         vehicles: M, the ego included; None: as many as ``scenes`` has, 9 without.
-        spawn_parameters, episode: Table II; decision period, goal and time-out.
-        ego, idm, steering: the ego's lane changes and visibility, car following (Table V) and
-            steering.
+        spawn_parameters: random initial scenes, Table II.
+        ego: the ego's lane changes, visibility and soft crashes.
+        episode: decision period, goal and time-out.
+        idm: the ego's car following, Table V.
+        steering: of the ego.
         seed: base of the random numbers; ``set_seed`` changes it for the next full reset.
         first_episode: row i starts with episode ``first_episode + i`` and continues in steps of N.
         scenes: initial vehicles of an episode and their visibility; None: at random, by
@@ -83,11 +85,13 @@ class HighwayEnv(EnvBase):
             (:mod:`ganlane.native`), which does the same up to rounding, for all shipped traffic
             but recordings, on a CPU and without gradients; ``auto``, the kernel where it can.
 
-    An episode is (the traffic's stream, seed, episode), whatever the batch. ``reset(td)`` with
-    ``seed`` and ``episode`` [N] in ``td`` and no ``_reset`` mask runs exactly those episodes. With
-    a mask the masked rows continue with their episode plus N, or ``next_episode`` [N] of
-    ``reset(td, next_episode=...)``, on the seed in ``td``. :attr:`recorder`, if set, is called
-    after every physics step.
+    An episode is (the traffic's stream, seed, episode), whatever the batch.
+
+    ``reset(td)`` with ``seed`` and ``episode`` [N] in ``td`` and no ``_reset`` mask runs exactly
+    those episodes. With a mask the masked rows continue with their episode plus N, or
+    ``next_episode`` [N] of ``reset(td, next_episode=...)``, on the seed in ``td``.
+
+    :attr:`recorder`, if set, is called after every physics step.
 
     Raises:
         UserError: the vehicles do not fit on the road or could not brake in time, the decision
@@ -126,11 +130,13 @@ class HighwayEnv(EnvBase):
             )
         if scenes is not None and not callable(scenes):
             raise UserError(f"scenes={scenes!r:.80}: expected scenes; give a FixedScene, say.")
+
         # The bounds of the settings lie within.
         whole_number("num_envs", num_envs, 1, 2**20)
         whole_number("first_episode", first_episode, 0, 2**62)
         if vehicles is not None:
             whole_number("vehicles", vehicles, 1, 1000)
+
         # Checked before EnvBase allocates anything on it.
         device = usable_device(device, dtype)
         super().__init__(device=device, batch_size=torch.Size([int(num_envs)]))
@@ -165,8 +171,10 @@ class HighwayEnv(EnvBase):
             self.actions,
             mobil,
         )
+
         self._check_parts(vehicles)
 
+        #: Called after every physics step; None: nobody looks.
         self.recorder: Recorder | None = None
         #: Seed and episode [N] of the rows in the last call; automatic resets continue from there.
         self.last_episodes: tuple[Tensor, Tensor] | None = None
@@ -198,8 +206,8 @@ class HighwayEnv(EnvBase):
             self.road,
             vehicles,
             spawn,
-            ego_visibility=visibility,
-            others_visibility=self.traffic.visibility,
+            visibility,
+            self.traffic.visibility,
         )
 
     def _check_parts(self, vehicles: int | None) -> None:
@@ -391,10 +399,8 @@ class HighwayEnv(EnvBase):
         # An automatic reset goes on from these.
         self.last_episodes = (seed, episode)
 
-        if self.kernel is None:
-            after = self._tensor_step(tensordict)
-        else:
-            after = self._native_step(tensordict)
+        step = self._tensor_step if self.kernel is None else self._native_step
+        after = step(tensordict)
 
         # A transform writes the reward.
         reward = torch.zeros_like(after.get(keys.EGO).get("distance"))[:, None]
@@ -516,8 +522,7 @@ class HighwayEnv(EnvBase):
             state = kernel.decide(action, state, None)
 
             # A command off the road ends an episode before anything moves.
-            off_road = state.get(keys.EVENTS).get("out_of_road")[:, 0]
-            running = running & ~off_road
+            running = running & ~state.get(keys.EVENTS).get("out_of_road")[:, 0]
             if not running.any():
                 break
 

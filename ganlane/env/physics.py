@@ -218,8 +218,7 @@ def endings(
 
     if rules.scene_steps is not None:
         events["scene_end"] = step >= rules.scene_steps
-    timeout = round(rules.episode.timeout_s / PHYSICS_STEP_S)
-    events["timeout"] = step >= timeout
+    events["timeout"] = step >= round(rules.episode.timeout_s / PHYSICS_STEP_S)
     return events
 
 
@@ -426,8 +425,7 @@ def run_decision(
             memory = after.get(keys.TRAFFIC)
             ended.keep(before.running & ~now.running, memory)
         else:
-            keep_ended = partial(where_rows, before.running)
-            memory = after.get(keys.TRAFFIC).apply(keep_ended, memory)
+            memory = after.get(keys.TRAFFIC).apply(partial(where_rows, before.running), memory)
 
         if recorder is not None:
             recorder(now.vehicles, before.running)

@@ -103,13 +103,10 @@ def apply_controls(
     # A lane change starts where that is another lane than before.
     shift = torch.sign(target - ego.target_lane)[:, 0]
     starts = shift != 0
-    command = Command(
-        target_lane=target[:, 0],
-        direction=torch.where(starts, shift, direction),
-        starts=starts,
-        # The command alone does not leave the road: the body may, on its way (leaves_road).
-        off_road=torch.zeros_like(starts),
-    )
+    direction = torch.where(starts, shift, direction)
+    # The command alone does not leave the road: the body may, on its way (leaves_road).
+    off_road = torch.zeros_like(starts)
+    command = Command(target[:, 0], direction, starts, off_road)
 
     strongest = torch.where(pedal > 0, actions.strongest_acceleration, actions.strongest_braking)
     room = ((ego.desired_speed - ego.speed) / period_s).clamp_min(0.0)

@@ -84,16 +84,12 @@ def _room(vehicles: Vehicles, comes: Tensor, road: Road, idm: IdmParameters) -> 
     its = comes.to(torch.uint8).argmax(1, keepdim=True)
     one = Vehicles(*(field.gather(1, its) for field in vehicles))
     lanes = with_target(body_lanes(vehicles, road), vehicles)
-    its_lanes = LaneRange(
-        low=lanes.low.gather(1, its),
-        high=lanes.high.gather(1, its),
-    )
+    its_lanes = LaneRange(*(lane.gather(1, its) for lane in lanes))
 
     # Of two at the same position the one with the lower index is ahead.
     distance = vehicles.x - one.x
     ahead = (distance > 0.0) | ((distance == 0.0) & (slot < its))
-    room = leave_room(one, vehicles, (its_lanes, lanes), distance, ahead, idm)
-    return room.all(1)
+    return leave_room(one, vehicles, (its_lanes, lanes), distance, ahead, idm).all(1)
 
 
 def let_in_and_out(
@@ -142,11 +138,9 @@ def let_in_and_out(
 
         # Moved by whole lanes, who comes is as far from the centre of its lane as before.
         lanes = (lane - vehicles.target_lane).to(vehicles.y.dtype)
-        x = torch.where(comes, flow.from_m, vehicles.x)
-        beside_y = vehicles.y + lanes * road.lane_width_m
         moved = vehicles.with_(
-            x=x,
-            y=torch.where(comes, beside_y, vehicles.y),
+            x=torch.where(comes, flow.from_m, vehicles.x),
+            y=torch.where(comes, vehicles.y + lanes * road.lane_width_m, vehicles.y),
             target_lane=torch.where(comes, lane, vehicles.target_lane),
         )
 

@@ -49,10 +49,9 @@ def of_lane(numbers: OfLanes, lane: Tensor, like: Tensor) -> Tensor:
     """
     if isinstance(numbers, Tensor):
         index = lane.long().clamp(0, numbers.shape[1] - 1)
-        flat = numbers.gather(1, index.flatten(1))
-        return flat.view(index.shape)
-    of_road = constant(numbers, like)
-    return of_road[lane.long().clamp(0, len(numbers) - 1)]
+        return numbers.gather(1, index.flatten(1)).view(index.shape)
+
+    return constant(numbers, like)[lane.long().clamp(0, len(numbers) - 1)]
 
 
 def begins(road: Road) -> OfLanes:
@@ -105,8 +104,7 @@ def may_change(road: Road, lane: Tensor, side: Tensor, x: Tensor) -> Tensor:
     if not road.has_lane_ends:
         return there
     # Nobody changes out of a lane that does not exist where it is.
-    keeps = side == 0
-    return keeps | (there & exists(road, lane, x))
+    return (side == 0) | (there & exists(road, lane, x))
 
 
 def leaves_road(road: Road, y: Tensor, new_y: Tensor, x: Tensor) -> Tensor:
@@ -116,8 +114,7 @@ def leaves_road(road: Road, y: Tensor, new_y: Tensor, x: Tensor) -> Tensor:
     # Not by Road.lane_of, which clamps to the road: beside the outermost lane there is none.
     lane = torch.round(y / road.lane_width_m)
     side = torch.round(new_y / road.lane_width_m) - lane
-    crosses = side != 0
-    return crosses & ~may_change(road, lane, side, x)
+    return (side != 0) & ~may_change(road, lane, side, x)
 
 
 def room_before_wall(vehicles: Vehicles, lanes: Tensor, road: Road) -> Tensor:
@@ -126,8 +123,7 @@ def room_before_wall(vehicles: Vehicles, lanes: Tensor, road: Road) -> Tensor:
     Below 0 behind it.
     """
     front = vehicles.x + 0.5 * vehicles.length
-    wall = of_lane(walls(road), lanes, vehicles.x)
-    return wall - front[..., None]
+    return of_lane(walls(road), lanes, vehicles.x) - front[..., None]
 
 
 def hits_wall(vehicles: Vehicles, body: LaneRange, road: Road) -> Tensor:
@@ -155,8 +151,7 @@ def exiting(road: Road, like: Tensor) -> Tensor | None:
     if road.exit_lane is None:
         return None
     flow = road.flow or FlowParameters()
-    leaves = flow.exits(like.shape[-1])
-    return constant(leaves, like) > 0
+    return constant(flow.exits(like.shape[-1]), like) > 0
 
 
 def bias(
@@ -231,8 +226,7 @@ def from_start(stretches: RowStretches, start_m: Tensor, dtype: torch.dtype) -> 
 
     def moved(place_m: Tensor) -> Tensor:
         # FAR_M says that there is nothing, and stays that number.
-        moved_m = torch.where(place_m.abs() < FAR_M, place_m - start_m, place_m)
-        return moved_m.to(dtype)
+        return torch.where(place_m.abs() < FAR_M, place_m - start_m, place_m).to(dtype)
 
     return RowStretches(
         begin_m=moved(stretches.begin_m),
@@ -300,12 +294,9 @@ def ways_out(vehicles: Vehicles, road: Road, reach_m: float) -> WaysOut:
     to_the_left, to_the_right = out.unbind(-1)
     side = torch.where(to_the_left <= to_the_right, 1, -1)
     side = torch.where(torch.isfinite(out).any(-1), side, 0)
-    return WaysOut(
-        left=left,
-        right=right,
-        side=side,
-        urgency=torch.where(side != 0, here[..., 0], 0.0),
-    )
+
+    urgency = torch.where(side != 0, here[..., 0], 0.0)
+    return WaysOut(left, right, side, urgency)
 
 
 def stopping_room(
@@ -322,5 +313,4 @@ def stopping_room(
     """
     room = room_before_wall(vehicles, lanes, road)
     has_wall = of_lane(walls(road), lanes, vehicles.x) < FAR_M
-    stops_m = torch.where(keeps, room - TURN_OUT_M, room)
-    return stops_m, has_wall
+    return torch.where(keeps, room - TURN_OUT_M, room), has_wall

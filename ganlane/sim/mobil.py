@@ -170,9 +170,7 @@ def one_at_a_time(
 
     # The same question, asked of [R, W] vehicles.
     few = Vehicles(*(field[rows].gather(1, columns) for field in vehicles))
-    their_idm = idm
-    if isinstance(idm, DriverIdm):
-        their_idm = idm.of(rows, columns)
+    their_idm = idm.of(rows, columns) if isinstance(idm, DriverIdm) else idm
     wishes = wish[rows]
     asked = wishes.gather(1, columns)
     gives_way = _gives_way(few, scene.road, asked, their_idm, mobil)
@@ -206,8 +204,7 @@ def _gives_way(
     leader_speed = vehicles.speed[:, None, :]
     demand = idm_acceleration(speed, desired, pairs.ahead, leader_speed, idm.per_lane())
     near = (pairs.distance < mobil.exclusive_m) | (demand < -mobil.safe_deceleration)
-    rival_ahead = same & near & (pairs.order > 0)
-    return rival_ahead.any(-1)
+    return (same & near & (pairs.order > 0)).any(-1)
 
 
 def falling_behind(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
@@ -232,7 +229,7 @@ def letting_past(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameter
     makes room, m/s2, [N, K]; infinite for others.
 
     It brakes with ``courtesy`` where the follower in the lane that it has to reach makes the change
-    unsafe, until that one is so much faster as a second of this braking makes it, and goes past.
+    unsafe, until that one is faster by as much as a second of this braking makes, and goes past.
     One who stands, or brakes with more than half of ``courtesy``, makes room or waits itself: for
     that one the driver does not wait. Drivers who have to change adapt their speed to the gap
     beside them so in Hidas (2005) and Schakel, Knoop and van Arem (2012).

@@ -105,10 +105,7 @@ def read_roads(path: str | Path) -> dict[str, Stretches]:
     if not isinstance(content, dict):
         raise UserError(f"{path}: expected an object of scenes; see docs/traffic.md.")
 
-    roads = {}
-    for scene, lanes in content.items():
-        roads[scene] = _stretches(lanes, f"{path}: {scene}")
-    return roads
+    return {scene: _stretches(lanes, f"{path}: {scene}") for scene, lanes in content.items()}
 
 
 def with_ego_speed(scene: FixedScene, desired_speed_mps: float) -> FixedScene:

@@ -355,6 +355,5 @@ def recycle(vehicles: Vehicles, road: Road, idm: IdmParameters) -> Vehicles:
 
     # Nobody is in its own way, at neither of its positions.
     itself = torch.eye(count, dtype=torch.bool, device=away.device).repeat(1, 2)
-    has_room = (room | itself).all(-1)
-    goes = away & has_room
+    goes = away & (room | itself).all(-1)
     return vehicles.with_(x=torch.where(goes, moved.x, vehicles.x))

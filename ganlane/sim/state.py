@@ -86,8 +86,7 @@ class Vehicles(NamedTuple):
     def with_first(self, first: Vehicles) -> Vehicles:
         """The same rows with vehicle 0 replaced by ``first`` (fields [N])."""
         # By where, not by writing in place: the tensors may belong to the caller.
-        column = first.part((slice(None), None))
-        return column.where(self.is_ego()[None], self)
+        return first.part((slice(None), None)).where(self.is_ego()[None], self)
 
     def with_finite_padding(self) -> Vehicles:
         """The same vehicles with finite numbers in invalid entries: NaN would spread in sums."""
@@ -186,8 +185,7 @@ class Road:
 
     def lane_of(self, y: Tensor) -> Tensor:
         """Lane of the road whose centre is nearest to lateral position ``y``, m; float."""
-        nearest = torch.round(y / self.lane_width_m)
-        return self.clamp_lane(nearest)
+        return self.clamp_lane(torch.round(y / self.lane_width_m))
 
     def centre_of(self, lane: Tensor, dtype: torch.dtype | None = None) -> Tensor:
         """Lateral position of the centre of ``lane``, m, in ``dtype``; None: as ``lane``."""
@@ -291,8 +289,7 @@ def body_lanes(vehicles: Vehicles, road: Road) -> LaneRange:
     reach = lateral_half_extent(vehicles) - ENTRY_M
     # Right and left edge in one tensor, [2, N, M].
     edges = torch.stack((vehicles.y - reach, vehicles.y + reach))
-    low, high = road.lane_of(edges).unbind()
-    return LaneRange(low, high)
+    return LaneRange(*road.lane_of(edges).unbind())
 
 
 def with_target(lanes: LaneRange, vehicles: Vehicles) -> LaneRange:
@@ -333,5 +330,4 @@ def lane_change_done(vehicles: Vehicles, road: Road) -> Tensor:
     Bool, of the shape of the vehicles' fields.
     """
     centre = road.centre_of(vehicles.target_lane, vehicles.y.dtype)
-    distance = (vehicles.y - centre).abs()
-    return distance < ARRIVED_M
+    return (vehicles.y - centre).abs() < ARRIVED_M

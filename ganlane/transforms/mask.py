@@ -154,8 +154,7 @@ class ActionMaskTransform(PerceptionTransform):
             mask, none = self.allowed(seen, direction, road_in(state, self.road))
 
         if self.actions.form == LANE_SPEED:
-            speeds = allowed_speeds(state, self.actions)
-            mask = torch.cat((mask, speeds), dim=1)
+            mask = torch.cat((mask, allowed_speeds(state, self.actions)), dim=1)
 
         # With ``legal`` there is one out key alone.
         for name, flags in zip(self.out_keys, (mask, none[:, None])):

@@ -138,8 +138,7 @@ def own_state(view: View, here: bool = False) -> Tensor:
     # Whether there is a lane to change to, [N, 2].
     there = may_change(road, lane, sides, ego.x) if here else on_road(road, lane + sides)
 
-    ratio = ego.speed / ego.desired_speed
-    return torch.cat((ratio, there.to(ego.y.dtype)), dim=1)
+    return torch.cat((ego.speed / ego.desired_speed, there.to(ego.y.dtype)), dim=1)
 
 
 def vehicle_list(view: View) -> Tensor:
@@ -402,9 +401,7 @@ class ObservationTransform(PerceptionTransform):
 
         # Some actions need further numbers.
         if CONTROL_NUMBERS[self.actions.form]:
-            set_speed = None
-            if self.actions.form == LANE_SPEED:
-                set_speed = ego.get(keys.SET_SPEED)
+            set_speed = ego.get(keys.SET_SPEED) if self.actions.form == LANE_SPEED else None
             further = control_numbers(vehicles, set_speed, road)
             observation = torch.cat((observation, further), dim=1)
         return state.set(keys.OBSERVATION, observation)

@@ -72,8 +72,7 @@ class RewardTransform(StateTransform):
         for name in p.term_names[1:]:
             # A lane change is no event: the ego remembers whether it has started one.
             count = started if name == "lane_change" else events.get(name)
-            price = getattr(p, name)
-            terms[name] = price * count.to(speed.dtype)
+            terms[name] = getattr(p, name) * count.to(speed.dtype)
         return terms
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -89,8 +88,7 @@ class RewardTransform(StateTransform):
         # A reset has driven nothing, yet its keys must be those of a step.
         vehicles = tensordict_reset.get(keys.VEHICLES)
         zero = torch.zeros_like(vehicles.get("x")[:, :1])
-        terms = dict.fromkeys(self.parameters.term_names, zero)
-        return _write_terms(tensordict_reset, terms)
+        return _write_terms(tensordict_reset, dict.fromkeys(self.parameters.term_names, zero))
 
 
 def _write_terms(state: TensorDictBase, terms: dict[str, Tensor]) -> TensorDictBase:

@@ -158,14 +158,15 @@ class SensorTransform(StateTransform):
                 "environment with other sensors; start from a reset of this one."
             )
 
-        def moved_up(queue: Tensor, new: Tensor) -> Tensor:
-            """A field of the queue [N, K, M] without its oldest entry, and with the new one."""
-            return torch.cat((queue[:, 1:], new[:, None]), dim=1)
-
-        # The oldest measurement is delivered, and the newest joins the end of the queue.
+        # The oldest measurement is delivered ...
         oldest = waiting.apply(lambda queue: queue[:, 0].clone())
         next_tensordict.set(PERCEIVED, oldest)
-        queues = waiting.apply(moved_up, newest)
+
+        # ... and the newest joins the end of the queue, in every field [N, K, M].
+        queues = waiting.apply(
+            lambda queue, new: torch.cat((queue[:, 1:], new[:, None]), dim=1),
+            newest,
+        )
         return next_tensordict.set(SENSORS, queues)
 
     def _reset(

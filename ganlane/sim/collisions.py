@@ -77,12 +77,14 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
 
     # Most pairs are far apart: where a look at the numbers is cheap, only the others are tested.
     if reads_are_cheap(dx):
+        # Places [P] of the P near pairs in [N, M - 1].
         # Boxes overlap only within the sum of their half diagonals, each at most half of length
         # plus width.
         reach = vehicles.length.amax() + vehicles.width.amax()
         row, column = (dx.abs() < reach).nonzero().unbind(1)
         if len(row) == 0:
             return torch.zeros_like(both_valid)
+
         if dx.numel() >= FEW:
             ego = vehicles.part((row, 0))
             near = vehicles.part((row, column + 1))

@@ -37,6 +37,9 @@ def has_left(vehicles: Vehicles, road: Road, flow: FlowParameters) -> Tensor:
     """Whether each vehicle has passed the end of the section or of the exit lane, bool [N, M].
 
     The ego never leaves so: that is the end of its episode. Who waits outside has left already.
+
+    Args:
+        flow: that of the ``road``.
     """
     left = vehicles.x > flow.to_m
     if road.exit_lane is not None:
@@ -49,6 +52,7 @@ def _chosen(vehicles: Vehicles, road: Road, wanted: Tensor, number: Tensor) -> T
     """Who comes where somebody arrives, at most one of a row, bool [N, M].
 
     Args:
+        vehicles: [N, M], those who wait outside invalid.
         wanted: whether it leaves by the exit, bool [N].
         number: a random one of each slot, [N, M] int64, below ``2 ** _CHOICE_BITS``.
     """
@@ -80,6 +84,7 @@ def _room(vehicles: Vehicles, comes: Tensor, road: Road, idm: IdmParameters) -> 
         comes: bool [N, M], true of at most one of a row; where of none, the answer says nothing.
     """
     slot = torch.arange(vehicles.x.shape[1], device=vehicles.x.device)
+
     # Of who comes, [N, 1]: its slot, its fields, and the lanes that it attends to.
     its = comes.to(torch.uint8).argmax(1, keepdim=True)
     one = Vehicles(*(field.gather(1, its) for field in vehicles))
@@ -112,6 +117,8 @@ def let_in_and_out(
     """
     flow = road.flow
     assert flow is not None
+
+    # First those who leave: their slots are free for those who come.
     stays = ~has_left(vehicles, road, flow)
     vehicles = vehicles.with_(valid=vehicles.valid & stays)
 
@@ -144,7 +151,7 @@ def let_in_and_out(
             target_lane=torch.where(comes, lane, vehicles.target_lane),
         )
 
-        # Who is turned away waits where it was.
+        # Who is turned away waits where it was, and may come again.
         has_room = _room(moved, comes, road, idm)
         enters = comes & has_room[:, None]
         entered = moved.with_(valid=vehicles.valid | enters)

@@ -20,7 +20,14 @@ from ganlane.sim.state import spanned
 
 
 class DriverIdm(NamedTuple):
-    """IDM parameters of which some are tensors [N, M], one number per driver."""
+    """IDM parameters of which some are tensors [N, M], one number per driver.
+
+    Attributes:
+        min_gap_m: gap at a standstill, m.
+        headway_s: time headway, s.
+        comfortable_deceleration: m/s2, above 0.
+        min_acceleration, max_acceleration: bounds, m/s2; the first is the hardest braking, below 0.
+    """
 
     min_gap_m: float
     headway_s: Tensor
@@ -65,10 +72,9 @@ SMALLEST_GAP_M = 0.1
 def desired_gap(speed: Tensor, closing_speed: Tensor, parameters: AnyIdm = TABLE_V) -> Tensor:
     """Desired gap, m, at ``speed`` behind a leader approached at ``closing_speed``, m/s.
 
-    The dynamic part is never negative, so a faster leader does not reduce the desired gap below the
-    minimum.
+    IDM's ``s* = s0 + v T + v dv / (2 sqrt(a b))``. The dynamic part, all after ``s0``, is never
+    negative, so a faster leader does not reduce the desired gap below the minimum.
     """
-    # The last term is that of approaching a leader: v dv / (2 sqrt(a b)).
     approach = speed * closing_speed / parameters.brake_scale()
     dynamic = speed * parameters.headway_s + approach
     return parameters.min_gap_m + dynamic.clamp_min(0.0)
@@ -147,9 +153,13 @@ def acceleration_before_wall(
 ) -> Tensor:
     """IDM acceleration of each observer before the walls of ``lanes`` [N, K, L], m/s2.
 
-    Infinite without a wall. ``keeps``: whether it keeps that lane
-    (:func:`ganlane.sim.lane_ends.stopping_room`).
+    Infinite without a wall.
+
+    Args:
+        keeps: whether it keeps that lane, bool [N, K, L]
+            (:func:`ganlane.sim.lane_ends.stopping_room`).
     """
+    # A wall is as a leader that stands.
     room, has_wall = stopping_room(scene.observers, lanes, scene.road, keeps)
     standing = Neighbour(room, torch.zeros_like(room))
     acceleration = acceleration_behind(scene, standing, parameters)

@@ -163,7 +163,8 @@ def bias(
 ) -> Tensor:
     """How much a driver at ``x`` [N, K], m, wants to leave each of ``lanes`` [N, K, L], m/s2.
 
-    The first driver is the ego; some want to reach the exit lane (:func:`exiting`).
+    The first driver is the ego; some want to reach the exit lane (:func:`exiting`). 0 where nothing
+    is urgent.
 
     Args:
         strongest: at the end, m/s2.
@@ -222,9 +223,10 @@ def stretches_of_roads(roads: Sequence[Stretches]) -> RowStretches:
 
 
 def from_start(stretches: RowStretches, start_m: Tensor, dtype: torch.dtype) -> RowStretches:
-    """The stretches of each row by the distance from ``start_m`` [N, 1] on; in ``dtype``."""
+    """The stretches of each row, positions measured from ``start_m`` [N, 1] on, in ``dtype``."""
 
     def moved(place_m: Tensor) -> Tensor:
+        """Positions [N, L], m, measured from the start."""
         # FAR_M says that there is nothing, and stays that number.
         return torch.where(place_m.abs() < FAR_M, place_m - start_m, place_m).to(dtype)
 
@@ -276,7 +278,13 @@ class WaysOut(NamedTuple):
 
 
 def ways_out(vehicles: Vehicles, road: Road, reach_m: float) -> WaysOut:
-    """Where the drivers, the ego first, may and have to go; ``reach_m`` as of :func:`bias`."""
+    """Where the drivers may and have to go.
+
+    Args:
+        vehicles: [N, M], the ego first.
+        road: that they are on.
+        reach_m: as of :func:`bias`.
+    """
     # Own lane first, then left and right, [N, M, 3].
     lane = vehicles.target_lane
     sides = constant((0, 1, -1), lane)

@@ -149,6 +149,9 @@ def one_at_a_time(
 
     Too close means nearer than ``exclusive_m`` (centre to centre), or requiring unsafe braking.
     MOBIL's criteria do not cover this case, since neither vehicle is in that lane yet.
+
+    Args:
+        scene: with all vehicles as observers.
     """
     vehicles = scene.vehicles
     if not reads_are_cheap(wish):
@@ -217,6 +220,8 @@ def falling_behind(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParamet
 
     Args:
         ways: of the observers.
+        idm: that judges whether the change is safe.
+        mobil: what is safe, and how hard it brakes.
     """
     ahead = leader(scene, _wanted_lane(scene, ways))
     demand = acceleration_behind(scene, ahead, idm)
@@ -236,6 +241,8 @@ def letting_past(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameter
 
     Args:
         ways: of the observers.
+        idm: that judges whether the change is safe.
+        mobil: what is safe, and how hard it brakes.
     """
     # The follower in that lane, [N, K, 1].
     gap, index = nearest(scene, _wanted_lane(scene, ways), -1)
@@ -323,6 +330,9 @@ def mobil_wishes(
     equal. Where lanes end, nobody changes into a lane that it has to leave more urgently.
 
     Args:
+        scene: [N, K] observers.
+        idm: of all drivers, or of each (:class:`~ganlane.sim.idm.DriverIdm`).
+        mobil: of all drivers.
         politeness: as of :func:`mobil_criterion`.
     """
     vehicles = scene.observers

@@ -81,8 +81,7 @@ def read_scene(
 
     if rows:
         # The ego starts at 0, wherever the file has it.
-        ego_m = rows[0].x_m
-        stretches = tuple(stretch.seen_from(ego_m) for stretch in stretches)
+        stretches = tuple(stretch.seen_from(rows[0].x_m) for stretch in stretches)
 
     try:
         road = Road(int(count), float(width), stretches=stretches)

@@ -41,9 +41,8 @@ FORMS = tuple(form for form in MASKS if form != "none")
 
 def allowed_speeds(state: TensorDictBase, actions: ActionParameters) -> Tensor:
     """Whether ``faster`` and ``slower`` have an effect in ``state``, bool [N, 2]."""
-    set_speed = state.get(keys.EGO).get(keys.SET_SPEED)
     desired = state.get(keys.VEHICLES).get("desired_speed")[:, keys.EGO_INDEX]
-    return speed_changes(set_speed, desired, actions)
+    return speed_changes(state.get(keys.EGO).get(keys.SET_SPEED), desired, actions)
 
 
 class ActionMaskTransform(PerceptionTransform):
@@ -146,7 +145,7 @@ class ActionMaskTransform(PerceptionTransform):
         return torch.cat((keep, changes), dim=1), none
 
     def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
-        """Write ``action_mask``, and with ``safe`` ``no_safe_action``."""
+        """Write ``action_mask``, and with ``safe`` and ``foresight`` ``no_safe_action``."""
         direction = state.get(keys.EGO).get("change_direction")
         if self.native is not None:
             mask, none = self.native.allowed(seen, direction)

@@ -179,6 +179,7 @@ def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
 
     # Distances [N, 6, M - 1] in the six directions, out of reach for who is not there.
     distance = others.position[:, None, :] * ahead
+
     # At the range of sight the position is clipped to 1.
     in_sight = (others.valid & (others.position.abs() < 1.0))[:, None, :]
     on_that_end = (distance > 0) | ((distance == 0) & (ahead < 0))
@@ -187,6 +188,7 @@ def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
     absent = ~(in_sight & on_that_end & (lanes_apart == side))
     distance = torch.add(distance, absent, alpha=_MASKED)
 
+    # [N, 6, 1]
     nearest = distance.amin(-1, keepdim=True)
     # Several vehicles can be equally near: the minimum over all of them is taken below.
     farther = distance > nearest
@@ -230,6 +232,7 @@ def road_ahead(view: View) -> Tensor:
     road = view.road
     front = ego.x + 0.5 * ego.length
     lane = road.lane_of(ego.y)
+
     # Left, own and right lane, [N, 3].
     lanes = lane + constant((1.0, 0.0, -1.0), lane)
     there = on_road(road, lanes)
@@ -259,11 +262,16 @@ def _in_sight(distance_m: Tensor) -> Tensor:
 
 
 class Part(NamedTuple):
-    """A part of an observation: its numbers [N, size], and its size, all in all or per vehicle."""
+    """A part of an observation.
+
+    Attributes:
+        numbers: computes it, [N, size], or [N, size (M - 1)].
+        size: how many numbers it has, in all or of every other vehicle.
+        each_vehicle: whether ``size`` is that of every other vehicle.
+    """
 
     numbers: Callable[[View], Tensor]
     size: int
-    #: Whether ``size`` is that of each of the others.
     each_vehicle: bool = False
 
 

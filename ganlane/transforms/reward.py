@@ -61,6 +61,8 @@ class RewardTransform(StateTransform):
         vehicles = tensordict.get(keys.VEHICLES)
         ego = tensordict.get(keys.EGO)
         events = tensordict.get(keys.EVENTS)
+
+        # Columns [N, 1].
         speed = vehicles.get("speed")[:, EGO_INDEX, None]
         desired = vehicles.get("desired_speed")[:, EGO_INDEX, None]
         acceleration = ego.get("mean_acceleration")[:, None]
@@ -79,8 +81,7 @@ class RewardTransform(StateTransform):
         # Terms for tables and logs, their sum for the agent.
         terms = self.terms(next_tensordict)
         _write_terms(next_tensordict, terms)
-        reward = reduce(torch.add, terms.values())
-        return next_tensordict.set(keys.REWARD, reward)
+        return next_tensordict.set(keys.REWARD, reduce(torch.add, terms.values()))
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase

@@ -343,7 +343,7 @@ class HighwayEnv(EnvBase):
         if tensordict is not None:
             mask = tensordict.get("_reset", None)
         if mask is not None:
-            # [N, 1], as the done flags.
+            # TorchRL's has the shape of the done flags, [N, 1].
             mask = mask.reshape(-1)
         seed, episode = self._episodes(tensordict, mask, next_episode)
         self.last_episodes = (seed, episode)
@@ -424,7 +424,7 @@ class HighwayEnv(EnvBase):
         end, memory = run_decision(self.traffic, rules, state, start, key, self.recorder)
         ego = remember(rules, ego, start, end, command)
 
-        # Done flags, counters and road are not nested.
+        # Done flags, counters and road are beside those groups of fields.
         events, rest = outcome(end)
         rest[keys.SEED] = state.get(keys.SEED)
         rest[keys.EPISODE] = state.get(keys.EPISODE)
@@ -464,8 +464,8 @@ class HighwayEnv(EnvBase):
             UserError: a gradient is due with ``native``, or the action does not exist.
         """
         assert self.kernel is not None
-        floats = [*state.get(keys.VEHICLES).values(), *state.get(keys.EGO).values()]
-        if wants_gradient(floats):
+        fields = [*state.get(keys.VEHICLES).values(), *state.get(keys.EGO).values()]
+        if wants_gradient(fields):
             if self._must_be_native:
                 raise UserError(
                     "env.kernel=native has no gradients, and the state requires one; set "

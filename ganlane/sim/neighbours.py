@@ -160,7 +160,7 @@ def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scen
     attention = with_target(body, vehicles)
     x = vehicles.x
 
-    # All vehicles look, there are many pairs, and nothing of this stands against sorting.
+    # It pays where all vehicles observe and pairs are many, and is possible where the rest holds.
     sorts = (
         which == slice(None)
         and x.shape[0] * x.shape[1] ** 2 >= SORTS_FROM

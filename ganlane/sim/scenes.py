@@ -430,8 +430,8 @@ def check_drive(scene: FixedScene, idm: IdmParameters) -> None:
 @lru_cache(maxsize=64)
 def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, float] | None:
     """The first two vehicles that overlap and the time, s; None without an overlap."""
-    # Several episodes of the training stream, since jitter varies them.
-    # Fewer of large scenes, for which every pair of vehicles is looked at.
+    # Episodes of the training stream; fewer of large scenes, for which every pair of vehicles is
+    # looked at.
     most = max(1, MOST_VEHICLES**2 // scene.vehicles**2)
     # Without jitter all episodes are the same, and one drive tells.
     rows = min(DRIVES, most) if scene.jitter_m or scene.jitter_mps else 1

@@ -67,10 +67,15 @@ class Rules(NamedTuple):
 class Substep(NamedTuple):
     """State between two physics steps of a decision; fields [N] except the vehicles [N, M].
 
-    ``acceleration`` is the ego's for the next step, m/s2, ``line`` the one that it steers to, m.
-    ``ahead`` and ``behind`` are its soft
-    crashes, ``onsets`` counts their beginnings. ``end`` is the number of the event that has ended
-    the episode in :data:`ganlane.keys.END_EVENTS`, or :data:`RUNNING`.
+    Attributes:
+        acceleration: the ego's for the next step, m/s2.
+        steering: its steering angle, rad.
+        line: lateral position that it steers to, m.
+        ahead, behind: whether it is in a soft crash, bool.
+        step: physics steps since the start of the episode, int64.
+        onsets, onsets_behind: soft crashes that have begun in this decision, int64.
+        end: number of the event that has ended the episode in :data:`ganlane.keys.END_EVENTS`, or
+            :data:`RUNNING`.
     """
 
     vehicles: Vehicles
@@ -91,11 +96,21 @@ class Substep(NamedTuple):
 
 
 def begin(
-    rules: Rules, action: Tensor, vehicles: Vehicles, ego: Fields, step: Tensor
+    rules: Rules,
+    action: Tensor,
+    vehicles: Vehicles,
+    ego: Fields,
+    step: Tensor,
 ) -> tuple[Substep, Command]:
-    """The first moment of a decision, before anything moves.
+    """The first moment of a decision, before anything moves, and what the action commands.
 
     Rows whose command leaves the road have ended.
+
+    Args:
+        action: [N] int64, or [N, 2] for ``continuous``.
+        vehicles: [N, M].
+        ego: its memory of the last decision, [N] each.
+        step: physics steps since the start of the episode, [N] int64.
     """
     # The command sets the lane that the ego steers to; the motion itself takes several decisions.
     road = rules.road
@@ -107,19 +122,26 @@ def begin(
         command = controls.command
     else:
         command = apply_action(action, vehicles, direction, road, rules.ego.abort_lane_change)
+
     if rules.actions.form == LANE_SPEED:
         # Within the decision this is the speed that the ego desires, for all who look at it.
         desired = vehicles.desired_speed
-        speed = commanded_speed(action, ego[keys.SET_SPEED], desired[:, EGO_INDEX], rules.actions)
+        highest = desired[:, EGO_INDEX]
+        speed = commanded_speed(action, ego[keys.SET_SPEED], highest, rules.actions)
         vehicles = vehicles.with_(desired_speed=with_ego(speed, desired))
-    vehicles = vehicles.with_(target_lane=with_ego(command.target_lane, vehicles.target_lane))
+    target_lane = with_ego(command.target_lane, vehicles.target_lane)
+    vehicles = vehicles.with_(target_lane=target_lane)
+
     if controls is not None:
-        line, acceleration = controls.line, controls.acceleration
+        line = controls.line
+        acceleration = controls.acceleration
     else:
+        # To the centre of the target lane, behind whoever is ahead by IDM.
         line = road.centre_of(command.target_lane[:, None], vehicles.y.dtype)[:, 0]
         scene = ego_scene(vehicles, road)
         acceleration = following_acceleration(scene, rules.idm)[:, 0]
         acceleration = before_change(rules, scene, acceleration)
+
     none = torch.zeros_like(step)
     start = Substep(
         vehicles=vehicles,
@@ -137,14 +159,19 @@ def begin(
 
 
 def before_change(rules: Rules, scene: Scene, acceleration: Tensor) -> Tensor:
-    """The ego's ``acceleration`` [N], or less where it has to leave its lane soon; m/s2."""
+    """The ego's ``acceleration`` [N], or less where it has to leave its lane soon; m/s2.
+
+    ``scene`` has the ego as its only observer.
+    """
     if not rules.road.has_lane_ends or rules.mobil.courtesy == 0.0:
         return acceleration
+
     ways = ways_out(scene.observers, rules.road, rules.mobil.mandatory_m)
     behind = falling_behind(scene, ways, rules.idm, rules.mobil)
     # The ego cannot know whether those behind it make room.
     past = letting_past(scene, ways, rules.idm, rules.mobil)
-    return torch.minimum(acceleration, torch.minimum(behind, past)[:, 0])
+    courteous = torch.minimum(behind, past)[:, 0]
+    return torch.minimum(acceleration, courteous)
 
 
 def with_ego(number: Tensor, numbers: Tensor) -> Tensor:
@@ -153,7 +180,11 @@ def with_ego(number: Tensor, numbers: Tensor) -> Tensor:
 
 
 def endings(
-    rules: Rules, before: Vehicles, vehicles: Vehicles, scene: Scene, step: Tensor
+    rules: Rules,
+    before: Vehicles,
+    vehicles: Vehicles,
+    scene: Scene,
+    step: Tensor,
 ) -> Fields:
     """What may have ended an episode in the step from ``before`` to ``vehicles``, bool [N] by name.
 
@@ -169,16 +200,22 @@ def endings(
     if road.has_lane_ends:
         crash = crash | hits_wall(scene.observers, scene.body, road)[:, 0]
     events = {"hard_crash": crash}
+
     if rules.actions.form == CONTINUOUS:
         # Where the lane itself is commanded, the command alone can leave the road.
-        y, new_y, x = (field[:, :1] for field in (before.y, vehicles.y, vehicles.x))
+        # Columns [N, 1], as the numbers of roads that differ between rows.
+        y = before.y[:, :1]
+        new_y = vehicles.y[:, :1]
+        x = vehicles.x[:, :1]
         events["out_of_road"] = leaves_road(road, y, new_y, x)[:, 0]
+
     ego = vehicles.at(EGO_INDEX)
     # On a road with an exit that is the goal, wherever it is.
     if road.exit_lane is None:
         events["goal"] = ego.x >= rules.episode.goal_m
     else:
         events["goal"], events["missed_exit"] = at_exit(ego, road)
+
     if rules.scene_steps is not None:
         events["scene_end"] = step >= rules.scene_steps
     events["timeout"] = step >= round(rules.episode.timeout_s / PHYSICS_STEP_S)
@@ -198,21 +235,30 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
         PHYSICS_STEP_S,
         rules.steering,
     )
+
     # The others moved while they saw the ego where it was: all move at once, from one state.
     running = before.running
     vehicles = moved.with_first(ego)
     if not all_running:
         vehicles = vehicles.where(running, before.vehicles)
         steering = torch.where(running, steering, before.steering)
+
+    # What the ego meets where it is now, and how it goes on from there.
     scene = ego_scene(vehicles, rules.road)
     acceleration, ahead, behind = ego_surroundings(scene, rules.idm, rules.ego)
     acceleration = before_change(rules, scene, acceleration)
     if rules.actions.form == CONTINUOUS:
+        # The command holds for the whole decision.
         acceleration = before.acceleration
+
+    # The first event in the order of precedence ends the episode.
     step = before.step + running
     end = before.end
-    for name, happens in endings(rules, before.vehicles, vehicles, scene, step).items():
-        end = torch.where((end == RUNNING) & happens, keys.END_EVENTS.index(name), end)
+    events = endings(rules, before.vehicles, vehicles, scene, step)
+    for name, happens in events.items():
+        ends_now = (end == RUNNING) & happens
+        end = torch.where(ends_now, keys.END_EVENTS.index(name), end)
+
     return Substep(
         vehicles=vehicles,
         acceleration=acceleration,
@@ -229,17 +275,29 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
 
 
 def remember(
-    rules: Rules, before: Fields, start: Substep, end: Substep, command: Command
+    rules: Rules,
+    before: Fields,
+    start: Substep,
+    end: Substep,
+    command: Command,
 ) -> Fields:
-    """The ego's memory after a decision from ``start`` to ``end``."""
+    """The ego's memory after a decision from ``start`` to ``end``, fields [N].
+
+    ``before`` is its memory at ``start``, ``command`` what it was told to do.
+    """
     # Over the whole decision, which may have ended early.
     ego = end.vehicles.at(EGO_INDEX)
     speed = start.vehicles.speed[:, EGO_INDEX]
-    arrived = lane_change_done(end.vehicles.columns(slice(0, 1)), rules.road)[:, 0]
+
+    # A column [N, 1], as the numbers of roads that differ between rows.
+    column = end.vehicles.columns(slice(0, 1))
+    arrived = lane_change_done(column, rules.road)[:, 0]
     direction = torch.where(arrived, 0, command.direction)
+
     # A row that ended at once drove no step: its speed did not change either.
     steps = (end.step - start.step).clamp_min(1)
     seconds = steps.to(ego.speed.dtype) * PHYSICS_STEP_S
+
     memory = {
         "steering": end.steering,
         "mean_acceleration": (ego.speed - speed) / seconds,
@@ -260,7 +318,9 @@ def remember(
 def outcome(end: Substep) -> tuple[Fields, Fields]:
     """Events and done flags of a decision, each [N, 1]; every end has exactly one reason."""
     events = {name: end.end == number for number, name in enumerate(keys.END_EVENTS)}
-    events |= {keys.SOFT_CRASH: end.onsets, keys.SOFT_CRASH_BEHIND: end.onsets_behind}
+    events[keys.SOFT_CRASH] = end.onsets
+    events[keys.SOFT_CRASH_BEHIND] = end.onsets_behind
+
     # After the outcomes of the driving come the cut-offs.
     done = ~end.running
     truncated = end.end >= len(keys.TERMINAL_EVENTS)
@@ -269,6 +329,7 @@ def outcome(end: Substep) -> tuple[Fields, Fields]:
 
 
 def _columns(values: Fields) -> Fields:
+    """Fields [N] as [N, 1]."""
     return {name: value[:, None] for name, value in values.items()}
 
 
@@ -322,8 +383,10 @@ def run_decision(
     wait for the queue, kept in every step.
 
     Args:
+        traffic: moves the other vehicles.
         state, start: at the beginning of the decision, and its first moment.
         key: of the episodes, [N] int64.
+        recorder: called after every physics step; None: nobody looks.
     """
     memory = memory_of(state)
     now = start
@@ -331,14 +394,17 @@ def run_decision(
     counters = {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
     counters[keys.EPISODE_KEY] = key
     n = memory.batch_size[0]
+
     can_read = reads_are_cheap(now.running)
     if can_read:
         ended.keep(~now.running, memory)
+
     for count in range(rules.episode.substeps()):
         before = now
         # On a CPU the remaining steps are left out once every row has ended.
         if known_false(before.running.any()):
             break
+
         # The traffic's clock continues in ended rows: stopped at a moment of decision it would make
         # these rows' drivers decide in all remaining steps, in vain.
         fields = {
@@ -348,15 +414,19 @@ def run_decision(
             keys.STEP: start.step + count,
         }
         after = traffic(new_tensordict(fields, n))
+
+        # Then the ego.
         all_running = known_false((~before.running).any())
         moved = Vehicles.of(after.get(keys.MOVED))
         now = advance(rules, before, moved, all_running)
+
         # The memory of ended rows: put aside when they end, or kept by a copy in every step.
         if can_read:
             memory = after.get(keys.TRAFFIC)
             ended.keep(before.running & ~now.running, memory)
         else:
             memory = after.get(keys.TRAFFIC).apply(partial(where_rows, before.running), memory)
+
         if recorder is not None:
             recorder(now.vehicles, before.running)
     return now, ended.restore(memory)

@@ -38,7 +38,7 @@ DONE: Fields = dict.fromkeys(keys.DONE_FLAGS, torch.bool)
 
 
 def spec_of(state: TensorDictBase) -> Composite:
-    """Spec of such states, nested as this one."""
+    """TorchRL's spec of such states, nested as this one, without bounds."""
     specs: dict[str, Any] = {}
     for name, value in state.items():
         if isinstance(value, Tensor):
@@ -58,7 +58,14 @@ def first_state(
     memory: TensorDictBase,
     actions: ActionParameters,
 ) -> TensorDictBase:
-    """The state of the episodes (``seed``, ``episode``) [N] that begin, without roads."""
+    """The state of the episodes (``seed``, ``episode``) [N] that begin, without roads.
+
+    Args:
+        seed, episode: counters, [N] int64.
+        vehicles: the first scene of each, [N, M].
+        memory: the traffic's.
+        actions: what the ego remembers depends on them.
+    """
     # Everything starts at 0, false, and no lane change.
     row = vehicles.x.new_zeros(seed.shape)
     column = row[:, None]
@@ -66,10 +73,17 @@ def first_state(
     if actions.form == LANE_SPEED:
         # The speed aimed at, m/s.
         ego[keys.SET_SPEED] = vehicles.desired_speed[:, keys.EGO_INDEX].clone()
+
+    # TorchRL wants done flags, and with them events, as columns [N, 1].
     events = {name: column.to(kind) for name, kind in EVENTS.items()}
     done = {name: column.to(kind) for name, kind in DONE.items()}
-    counters = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}
-    return pack(vehicles, ego, memory, events, {**counters, **done})
+    rest = {
+        keys.SEED: seed,
+        keys.EPISODE: episode,
+        keys.STEP: torch.zeros_like(seed),
+        **done,
+    }
+    return pack(vehicles, ego, memory, events, rest)
 
 
 def pack(
@@ -79,12 +93,23 @@ def pack(
     events: dict[str, Tensor],
     rest: dict[str, Any],
 ) -> TensorDictBase:
-    """The state as one TensorDict [N]; ``rest`` is not nested."""
+    """The state as one TensorDict [N].
+
+    Args:
+        vehicles, ego, events: [N, M], [N] and [N, 1]; each becomes a nested TensorDict.
+        traffic: its memory, a TensorDict already.
+        rest: what else the state has, by its key.
+    """
     # The first axis of every field is the batch.
     batch = ego["distance"].shape
     # In a graph, moving the traffic's part to its own device would be an error.
     device = None if torch.compiler.is_compiling() else ego["distance"].device
-    nested = {keys.VEHICLES: vehicles.as_dict(), keys.EGO: ego, keys.EVENTS: events}
+
+    nested = {
+        keys.VEHICLES: vehicles.as_dict(),
+        keys.EGO: ego,
+        keys.EVENTS: events,
+    }
     parts: dict[str, Any] = {keys.TRAFFIC: traffic, **rest}
     for name, fields in nested.items():
         parts[name] = TensorDict._new_unsafe(fields, batch_size=batch, device=device)
@@ -95,14 +120,19 @@ def pack(
 
 
 def check_counter(name: str, counter: Tensor | None, rows: int) -> Tensor:
-    """``counter`` [N] int64 of a reset.
+    """``counter`` [N] int64 of a reset, unchanged.
+
+    Args:
+        name: of the counter, for the message.
+        rows: N.
 
     Raises:
         UserError: it is none, or of another shape or type.
     """
-    # float counters would be rounded from 2**24 episodes on.
+    # Float counters would be rounded from 2**24 episodes on.
     if counter is None or counter.shape != (rows,) or counter.dtype != torch.int64:
         what = "missing" if counter is None else f"{list(counter.shape)} in {counter.dtype}"
+        # Seed and episode are handed in together.
         wanted = name if name == "next_episode" else "'seed' and 'episode'"
         raise UserError(
             f"reset(): {name} is {what}; give {wanted} as int64 of shape [{rows}], or leave it out."
@@ -122,11 +152,13 @@ def usable_device(device: Any, dtype: Any) -> torch.device:
             f"dtype={dtype}: the simulation runs in torch.float32 or torch.float64; "
             "give one of them."
         )
+
     try:
         # torch itself knows which devices there are.
         chosen = torch.empty(0, device=device or "cpu").device
     except (RuntimeError, AssertionError, TypeError) as error:
         raise UserError(f"device={device}: no such device here; use device='cpu'.") from error
+
     if chosen.type == "meta":
         raise UserError("device=meta: it holds no numbers; use device='cpu'.")
     check_default_device(chosen.type)
@@ -134,12 +166,17 @@ def usable_device(device: Any, dtype: Any) -> torch.device:
 
 
 def checked_action(
-    action: Tensor | None, rows: int, actions: ActionParameters, values: bool = True
+    action: Tensor | None,
+    rows: int,
+    actions: ActionParameters,
+    values: bool = True,
 ) -> Tensor:
     """``action`` [N] as int64, or [N, 2] for ``actions`` that are not numbered.
 
-    ``values=False`` leaves out that of the values, which the native kernel looks at itself. It
-    waits for a GPU's queue.
+    Args:
+        rows: N.
+        values: whether to check the values of numbered actions too, which waits for a GPU's queue;
+            the native kernel looks at them itself.
 
     Raises:
         UserError: there is none, or it has another shape, no whole numbers, others than the actions
@@ -149,17 +186,20 @@ def checked_action(
         raise UserError(f"step(): no action; give 'action', {_expected(rows, actions)}.")
     if not actions.names:
         return _checked_controls(action, rows, actions)
+
     count = len(actions.names)
     # Flags and floats would be cast without a word.
     if action.shape != (rows,) or action.is_floating_point() or action.dtype == torch.bool:
         raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows, actions)
+
     action = action.long()
     if torch.compiler.is_compiling():
         # A graph cannot branch on values.
         legal = (action >= 0) & (action < count)
         torch._assert_async(legal.all(), f"action: each must be 0 to {count - 1}")
     elif values:
-        # As unsigned numbers, of which those below 0 are large, and by NumPy: some microseconds.
+        # As unsigned numbers, of which those below 0 are large: one comparison is enough. By NumPy,
+        # which saves some microseconds.
         numbers = action.cpu().numpy()
         wrong = numbers.view(np.uint64) >= count
         if wrong.any():
@@ -168,8 +208,10 @@ def checked_action(
 
 
 def _checked_controls(action: Tensor, rows: int, actions: ActionParameters) -> Tensor:
+    """``action`` [N, 2] of ``continuous``; raises as :func:`checked_action`."""
     if action.shape != (rows, CONTROLS) or not action.is_floating_point():
         raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows, actions)
+
     finite = torch.isfinite(action).all()
     if torch.compiler.is_compiling():
         torch._assert_async(finite, "action: each number must be finite")
@@ -179,6 +221,7 @@ def _checked_controls(action: Tensor, rows: int, actions: ActionParameters) -> T
 
 
 def _expected(rows: int, actions: ActionParameters) -> str:
+    """What an action has to be, as part of a message."""
     if not actions.names:
         return f"floats of shape [{rows}, {CONTROLS}] from -1 to 1"
     return f"{rows} whole numbers (int64, shape [{rows}]), each {actions.meanings()}"

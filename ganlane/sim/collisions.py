@@ -37,7 +37,10 @@ def boxes_overlap(dx: Tensor, one: Vehicles, other: Vehicles) -> Tensor:
     half_sizes = [(0.5 * box.length, 0.5 * box.width) for box in (one, other)]
 
     def separated(
-        along: Tensor, across: Tensor, box: tuple[Tensor, Tensor], against: tuple[Tensor, Tensor]
+        along: Tensor,
+        across: Tensor,
+        box: tuple[Tensor, Tensor],
+        against: tuple[Tensor, Tensor],
     ) -> Tensor:
         """Whether an axis of a box separates it from the other.
 
@@ -53,10 +56,14 @@ def boxes_overlap(dx: Tensor, one: Vehicles, other: Vehicles) -> Tensor:
         return (along.abs() >= reach_along) | (across.abs() >= reach_across)
 
     # The vector between the centres, turned into the axes of the one and of the other box.
-    by_one = separated(dx * cos_one + dy * sin_one, dy * cos_one - dx * sin_one, *half_sizes)
+    along_one = dx * cos_one + dy * sin_one
+    across_one = dy * cos_one - dx * sin_one
+    by_one = separated(along_one, across_one, *half_sizes)
+
     along_other = dx * cos_other + dy * sin_other
     across_other = dy * cos_other - dx * sin_other
     by_other = separated(along_other, across_other, *reversed(half_sizes))
+
     return ~(by_one | by_other)
 
 
@@ -70,17 +77,20 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
 
     # Most pairs are far apart: where a look at the numbers is cheap, only the others are tested.
     if reads_are_cheap(dx):
+        # Places [P] of the P near pairs in [N, M - 1].
         # Boxes overlap only within the sum of their half diagonals, each at most half of length
         # plus width.
         reach = vehicles.length.amax() + vehicles.width.amax()
         row, column = (dx.abs() < reach).nonzero().unbind(1)
         if len(row) == 0:
             return torch.zeros_like(both_valid)
+
         if dx.numel() >= FEW:
             ego = vehicles.part((row, 0))
             near = vehicles.part((row, column + 1))
             hits = boxes_overlap(dx[row, column], ego, near)
-            return torch.zeros_like(both_valid).index_put((row, column), hits) & both_valid
+            hit = torch.zeros_like(both_valid).index_put((row, column), hits)
+            return hit & both_valid
 
     # [N, 1] against [N, M - 1].
     ego = vehicles.columns(slice(0, 1))
@@ -104,7 +114,10 @@ def pair_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
 
 
 def dangerously_close(
-    gap: Tensor, closing_speed: Tensor, ttc_s: float = 1.5, gap_m: float = 2.0
+    gap: Tensor,
+    closing_speed: Tensor,
+    ttc_s: float = 1.5,
+    gap_m: float = 2.0,
 ) -> Tensor:
     """Whether this is a soft crash, elementwise, bool.
 

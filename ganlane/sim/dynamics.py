@@ -227,27 +227,29 @@ def ego_surroundings(
     """The ego's IDM acceleration, m/s2, and whether it has a soft crash ahead, and behind; each
     [N].
 
-    IDM considers the leaders in all lanes that the ego attends to, soft crashes only the lanes that
-    its body is in.
+    The ego is the only observer of ``scene``. IDM considers the leaders in all lanes that it
+    attends to, soft crashes only the lanes that its body is in.
     """
     # The driver brakes for who is in a lane it is going to; a soft crash needs its body there.
     attention = spanned(scene.attention)
     body = spanned(scene.body)
+
     # One search for both kinds of lanes.
     gap, speed = leader(scene, torch.cat((attention, body), dim=-1))
     attended = attention.shape[-1]
     followed = Neighbour(gap[..., :attended], speed[..., :attended])
     near = Neighbour(gap[..., attended:], speed[..., attended:])
     behind = follower(scene, body)
+
     speed = scene.observers.speed[..., None]
     # Who is behind closes in if it is the faster one.
     closing = torch.where(behind.exists, behind.speed - speed, 0.0)
     limits = (ego.soft_crash_ttc_s, ego.soft_crash_gap_m)
-    return (
-        acceleration_in(scene, attention, followed, idm)[:, 0],
-        dangerously_close(near.gap, speed - near.speed, *limits).any(-1)[:, 0],
-        dangerously_close(behind.gap, closing, *limits).any(-1)[:, 0],
-    )
+
+    acceleration = acceleration_in(scene, attention, followed, idm)[:, 0]
+    close_ahead = dangerously_close(near.gap, speed - near.speed, *limits).any(-1)[:, 0]
+    close_behind = dangerously_close(behind.gap, closing, *limits).any(-1)[:, 0]
+    return acceleration, close_ahead, close_behind
 
 
 def change_progress(ego: Vehicles, direction: Tensor, road: Road) -> Tensor:

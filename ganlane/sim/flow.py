@@ -36,7 +36,10 @@ _CHOICE_BITS = 24
 def has_left(vehicles: Vehicles, road: Road, flow: FlowParameters) -> Tensor:
     """Whether each vehicle has passed the end of the section or of the exit lane, bool [N, M].
 
-    The ego never leaves so: that is the end of its episode.
+    The ego never leaves so: that is the end of its episode. Who waits outside has left already.
+
+    Args:
+        flow: that of the ``road``.
     """
     left = vehicles.x > flow.to_m
     if road.exit_lane is not None:
@@ -49,10 +52,13 @@ def _chosen(vehicles: Vehicles, road: Road, wanted: Tensor, number: Tensor) -> T
     """Who comes where somebody arrives, at most one of a row, bool [N, M].
 
     Args:
+        vehicles: [N, M], those who wait outside invalid.
         wanted: whether it leaves by the exit, bool [N].
         number: a random one of each slot, [N, M] int64, below ``2 ** _CHOICE_BITS``.
     """
     slot = torch.arange(vehicles.x.shape[1], device=number.device)
+
+    # Who goes another way than wanted; without an exit all go the same.
     exits = exiting(road, number)
     other_way = torch.zeros_like(vehicles.valid) if exits is None else exits != wanted[:, None]
 
@@ -64,6 +70,7 @@ def _chosen(vehicles: Vehicles, road: Road, wanted: Tensor, number: Tensor) -> T
     rank = number + (other_way.long() << _CHOICE_BITS)
     rank = torch.where(waits, rank, 1 << (_CHOICE_BITS + 1))
     is_first = rank == rank.amin(1, keepdim=True)
+
     # Of equal numbers the lowest slot.
     lowest = torch.where(is_first, slot, len(slot)).amin(1, keepdim=True)
     return waits & (slot == lowest)
@@ -72,9 +79,12 @@ def _chosen(vehicles: Vehicles, road: Road, wanted: Tensor, number: Tensor) -> T
 def _room(vehicles: Vehicles, comes: Tensor, road: Road, idm: IdmParameters) -> Tensor:
     """Whether nobody, the one who ``comes`` included, brakes harder than is safe, bool [N].
 
-    ``vehicles`` has it at its new position; ``comes`` bool [N, M] is true of at most one of a row.
+    Args:
+        vehicles: [N, M], the one who comes at its new position.
+        comes: bool [N, M], true of at most one of a row; where of none, the answer says nothing.
     """
     slot = torch.arange(vehicles.x.shape[1], device=vehicles.x.device)
+
     # Of who comes, [N, 1]: its slot, its fields, and the lanes that it attends to.
     its = comes.to(torch.uint8).argmax(1, keepdim=True)
     one = Vehicles(*(field.gather(1, its) for field in vehicles))
@@ -88,11 +98,17 @@ def _room(vehicles: Vehicles, comes: Tensor, road: Road, idm: IdmParameters) -> 
 
 
 def let_in_and_out(
-    vehicles: Vehicles, road: Road, idm: IdmParameters, key: Tensor, step: Tensor, period_s: float
+    vehicles: Vehicles,
+    road: Road,
+    idm: IdmParameters,
+    key: Tensor,
+    step: Tensor,
+    period_s: float,
 ) -> Vehicles:
     """``vehicles`` [N, M] after some have left and others have entered.
 
     Args:
+        vehicles: all slots, those who wait outside invalid.
         road: with a flow.
         idm: that judges whether there is room.
         key: of the episodes, [N] int64.
@@ -101,12 +117,16 @@ def let_in_and_out(
     """
     flow = road.flow
     assert flow is not None
-    vehicles = vehicles.with_(valid=vehicles.valid & ~has_left(vehicles, road, flow))
+
+    # First those who leave: their slots are free for those who come.
+    stays = ~has_left(vehicles, road, flow)
+    vehicles = vehicles.with_(valid=vehicles.valid & stays)
 
     # [N, L, 2] in float64, as the probabilities are: whether somebody arrives, and by the exit.
     arrivals = flow.arrivals(road.stretches, period_s)
     purposes = [Purpose.FLOW_ARRIVAL, Purpose.FLOW_EXIT]
     u = uniform(key, step, len(arrivals), purposes, torch.float64)
+
     # [N, M]: the highest bits of a number of each slot.
     keys = draw_keys(key, step, vehicles.x.shape[1], [Purpose.FLOW_SLOT])[..., 0]
     number = (keys >> (64 - _CHOICE_BITS)) & ((1 << _CHOICE_BITS) - 1)
@@ -114,8 +134,12 @@ def let_in_and_out(
     # Lane by lane, so that nobody enters beside one who has just done so without room.
     for lane, probability in enumerate(arrivals):
         arrives = u[:, lane, 0] < probability
-        if probability == 0.0 or (reads_are_cheap(arrives) and not bool(arrives.any())):
+        if probability == 0.0:
             continue
+        # Mostly nobody arrives: where a look at the numbers is cheap, the rest is left out.
+        if reads_are_cheap(arrives) and not bool(arrives.any()):
+            continue
+
         wanted = u[:, lane, 1] < flow.exit_share
         comes = _chosen(vehicles, road, wanted, number) & arrives[:, None]
 
@@ -127,7 +151,9 @@ def let_in_and_out(
             target_lane=torch.where(comes, lane, vehicles.target_lane),
         )
 
-        # Who is turned away waits where it was.
-        enters = comes & _room(moved, comes, road, idm)[:, None]
-        vehicles = moved.with_(valid=vehicles.valid | enters).where(enters, vehicles)
+        # Who is turned away waits where it was, and may come again.
+        has_room = _room(moved, comes, road, idm)
+        enters = comes & has_room[:, None]
+        entered = moved.with_(valid=vehicles.valid | enters)
+        vehicles = entered.where(enters, vehicles)
     return vehicles

@@ -42,6 +42,7 @@ def has_room(scene: Scene, lanes: Tensor, acceleration: Tensor, braking_mps2: fl
     """
     others = scene.vehicles
     ego = scene.observers
+
     # [N, L, M]: who is in a lane, or on the way there.
     drifted = others.y + DRIFT_S * others.speed * torch.sin(others.heading)
     towards = scene.road.lane_of(drifted)
@@ -49,16 +50,25 @@ def has_room(scene: Scene, lanes: Tensor, acceleration: Tensor, braking_mps2: fl
     high = torch.maximum(scene.presence.high, towards)[:, None]
     lane = lanes[..., None]
     there = (low <= lane) & (lane <= high) & others.valid[:, None]
+    # The ego is not in its own way.
     there[..., 0] = False
+
+    # Bumper to bumper, [N, M].
     distance = scene.road.distance_ahead(ego.x, others.x)
     gap = distance.abs() - 0.5 * (ego.length + others.length)
-    # The ego's way until it stands, or until the end of the horizon.
+
+    # The ego's way until it stands, or until the end of the horizon, m, [N, L].
     slows = acceleration.clamp_max(0.0)
     time = torch.where(slows < 0.0, ego.speed / -slows, HORIZON_S).clamp_max(HORIZON_S)
     way = ego.speed * time + 0.5 * slows * time * time
+
+    # What is left of the gap to a follower at the end of the horizon ...
     behind = gap[:, None] + way[..., None] - HORIZON_S * others.speed[:, None]
+    # ... and of that to a leader when both stand: v^2 / (2 b) is the way to a stop.
     stops = (others.speed**2 - ego.speed**2) / (2.0 * braking_mps2)
     ahead = gap + stops - REACTION_S * ego.speed
+
+    # There has to be room now too.
     left = torch.where(distance[:, None] > 0, ahead[:, None], behind)
     room = torch.minimum(gap[:, None], left) >= MARGIN_M
     return (room | ~there).all(-1)

@@ -20,7 +20,14 @@ from ganlane.sim.state import spanned
 
 
 class DriverIdm(NamedTuple):
-    """IDM parameters of which some are tensors [N, M], one number per driver."""
+    """IDM parameters of which some are tensors [N, M], one number per driver.
+
+    Attributes:
+        min_gap_m: gap at a standstill, m.
+        headway_s: time headway, s.
+        comfortable_deceleration: m/s2, above 0.
+        min_acceleration, max_acceleration: bounds, m/s2; the first is the hardest braking, below 0.
+    """
 
     min_gap_m: float
     headway_s: Tensor
@@ -44,7 +51,8 @@ class DriverIdm(NamedTuple):
     def brake_scale(self) -> Tensor | float:
         """As :meth:`IdmParameters.brake_scale`."""
         product = self.max_acceleration * self.comfortable_deceleration
-        return 2.0 * (product.sqrt() if isinstance(product, Tensor) else math.sqrt(product))
+        root = product.sqrt() if isinstance(product, Tensor) else math.sqrt(product)
+        return 2.0 * root
 
 
 AnyIdm: TypeAlias = IdmParameters | DriverIdm
@@ -64,10 +72,9 @@ SMALLEST_GAP_M = 0.1
 def desired_gap(speed: Tensor, closing_speed: Tensor, parameters: AnyIdm = TABLE_V) -> Tensor:
     """Desired gap, m, at ``speed`` behind a leader approached at ``closing_speed``, m/s.
 
-    The dynamic part is never negative, so a faster leader does not reduce the desired gap below the
-    minimum.
+    IDM's ``s* = s0 + v T + v dv / (2 sqrt(a b))``. The dynamic part, all after ``s0``, is never
+    negative, so a faster leader does not reduce the desired gap below the minimum.
     """
-    # The last term is that of approaching a leader: v dv / (2 sqrt(a b)).
     approach = speed * closing_speed / parameters.brake_scale()
     dynamic = speed * parameters.headway_s + approach
     return parameters.min_gap_m + dynamic.clamp_min(0.0)
@@ -89,12 +96,13 @@ def idm_acceleration(
         leader_speed: m/s; without a leader it only enters the (negligible) approach term.
         parameters: common to all drivers, or per driver (:class:`DriverIdm`).
     """
-    # The exponent 4 of the free-road term, without a power.
+    # a (1 - (v / v0)^4 - (s* / s)^2); the exponent 4 of the free-road term without a power.
     ratio = speed / desired_speed
     square = ratio * ratio
     wanted = desired_gap(speed, speed - leader_speed, parameters)
     interaction = wanted / gap.clamp_min(SMALLEST_GAP_M)
     acceleration = parameters.max_acceleration * (1.0 - square * square - interaction * interaction)
+
     # Where they overlap the interaction term is huge: the bound makes it the hardest braking.
     return acceleration.clamp(parameters.min_acceleration, parameters.max_acceleration)  # type: ignore[arg-type]
 
@@ -103,9 +111,11 @@ def equilibrium_gap(
     speed: Tensor, desired_speed: Tensor | float, parameters: IdmParameters = TABLE_V
 ) -> Tensor:
     """Gap, m, at which IDM keeps ``speed`` behind a leader of the same (below desired speed)."""
+    # Where the acceleration is 0: 1 - (v / v0)^4 = (s* / s)^2.
     ratio = speed / desired_speed
     square = ratio * ratio
-    return (parameters.min_gap_m + speed * parameters.headway_s) / torch.sqrt(1.0 - square * square)
+    wanted = parameters.min_gap_m + speed * parameters.headway_s
+    return wanted / torch.sqrt(1.0 - square * square)
 
 
 def acceleration_behind(scene: Scene, ahead: Neighbour, parameters: AnyIdm) -> Tensor:
@@ -143,9 +153,13 @@ def acceleration_before_wall(
 ) -> Tensor:
     """IDM acceleration of each observer before the walls of ``lanes`` [N, K, L], m/s2.
 
-    Infinite without a wall. ``keeps``: whether it keeps that lane
-    (:func:`ganlane.sim.lane_ends.stopping_room`).
+    Infinite without a wall.
+
+    Args:
+        keeps: whether it keeps that lane, bool [N, K, L]
+            (:func:`ganlane.sim.lane_ends.stopping_room`).
     """
+    # A wall is as a leader that stands.
     room, has_wall = stopping_room(scene.observers, lanes, scene.road, keeps)
     standing = Neighbour(room, torch.zeros_like(room))
     acceleration = acceleration_behind(scene, standing, parameters)
@@ -178,25 +192,39 @@ def _survives(
 ) -> Tensor:
     """Whether followers at ``speed_mps`` avoid a leader that from now on brakes at the limit.
 
-    The limit is ``idm.min_acceleration``.
-    Two vehicles, IDM, steps of 0.1 s. This leader is the worst of all that brake no harder than
-    ``idm.min_acceleration``: any other is always ahead of it and no slower. So a driver that avoids
-    this one also avoids crashes in a queue, where each leader may have to brake for its own.
+    The limit is ``idm.min_acceleration``. Two vehicles, IDM, steps of 0.1 s.
+
+    This leader is the worst of all that brake no harder than ``idm.min_acceleration``: any other is
+    always ahead of it and no slower. So a driver that avoids this one also avoids crashes in a
+    queue, where each leader may have to brake for its own.
+
+    Args:
+        gap_m, speed_mps: of the followers at the start; one of them may be a tensor, or both.
+        leader_speed_mps: of the leader at the start.
+        desired_speed_mps: of the followers.
+
+    Returns:
+        Bool, of the shape of the tensors.
     """
     # In float64, since 600 steps add up and the result decides whether a scene is refused.
     start = (gap_m, speed_mps, leader_speed_mps)
     numbers = [torch.as_tensor(number, dtype=torch.float64) for number in start]
     gap, speed, leader_now = torch.broadcast_tensors(*numbers)
-    smallest = first = gap
+    first = gap
+    smallest = gap
+
     # Trapezoids, as vehicles move in the simulation (dynamics.advance).
     for _ in range(round(HORIZON_S / PHYSICS_STEP_S)):
         acceleration = idm_acceleration(speed, desired_speed_mps, gap, leader_now, idm)
         next_speed = (speed + acceleration * PHYSICS_STEP_S).clamp_min(0.0)
         next_leader = (leader_now + idm.min_acceleration * PHYSICS_STEP_S).clamp_min(0.0)
-        gap = gap + 0.5 * PHYSICS_STEP_S * (leader_now + next_leader - speed - next_speed)
+        # Twice the mean speed of the leader less that of the follower.
+        opening = leader_now + next_leader - speed - next_speed
+        gap = gap + 0.5 * PHYSICS_STEP_S * opening
         speed = next_speed
         leader_now = next_leader
         smallest = torch.minimum(smallest, gap)
+
     # Where IDM's gap is cut off already at the start, it must only not shrink.
     return smallest >= first.clamp(1e-9, SMALLEST_GAP_M)
 
@@ -222,12 +250,14 @@ def least_gap(
     """Smallest gap, m, in steps of 0.1 m, from which on :func:`can_brake` is true."""
     # From full speed to a stop; a fifth and 10 m more is surely enough.
     stopping_m = speed_mps * speed_mps / (-2.0 * idm.min_acceleration)
-    gaps = torch.arange(1, int(10.0 * (1.2 * stopping_m + 10.0))).double() * 0.1
+    enough_m = 1.2 * stopping_m + 10.0
+    gaps = torch.arange(1, int(10.0 * enough_m)).double() * 0.1
     crashes = ~_survives(gaps, speed_mps, leader_speed_mps, desired_speed_mps, idm)
     if not bool(crashes.any()):
         return 0.1
-    # One step beyond the largest gap that is too small.
-    return 0.1 * (1 + int(crashes.nonzero().max()) + 1)
+    # One step beyond the largest gap that is too small; entry 0 is a gap of one step.
+    largest = 1 + int(crashes.nonzero().max())
+    return 0.1 * (largest + 1)
 
 
 def highest_speed(
@@ -239,4 +269,6 @@ def highest_speed(
     crashes = ~_survives(gap_m, speeds, leader_speed_mps, desired_speed_mps, idm)
     if not bool(crashes.any()):
         return float(speeds[-1])
-    return 0.1 * max(0, int(crashes.nonzero().min()) - 1)
+    # One step below the lowest speed that is too high.
+    lowest = int(crashes.nonzero().min())
+    return 0.1 * max(0, lowest - 1)

@@ -31,8 +31,11 @@ TABLE_IV = MobilParameters()
 class LaneAccelerations(NamedTuple):
     """Accelerations in the observer's lane and those beside it, m/s2, [N, K, L].
 
-    ``observer`` is the observer's; ``with_it`` and ``without`` are its follower's in that lane with
-    and without the observer in front of it, both 0 where there is no follower.
+    Attributes:
+        observer: the observer's own.
+        with_it: of its follower in that lane, with the observer in front of it; 0 where there is
+            no follower.
+        without: the same without the observer.
     """
 
     observer: Tensor
@@ -47,7 +50,8 @@ class LaneAccelerations(NamedTuple):
 def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelerations:
     """The :class:`LaneAccelerations` of each observer in ``lanes`` [N, K, L] (float).
 
-    With per-driver parameters, each driver predicts the others with its own parameters.
+    With per-driver parameters, each driver predicts the others with its own parameters: it does not
+    know theirs.
     """
     ahead = leader(scene, lanes)
     behind = follower(scene, lanes)
@@ -61,7 +65,8 @@ def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelera
     # ... and without it: behind the observer's leader, or alone.
     free = ahead.gap >= FREE_GAP_M
     leader_speed = torch.where(free, behind.speed, ahead.speed)
-    gap = torch.where(free, FREE_GAP_M, behind.gap + length + ahead.gap)
+    between = behind.gap + length + ahead.gap
+    gap = torch.where(free, FREE_GAP_M, between)
     without = idm_acceleration(*driver, gap, leader_speed, idm.per_lane())
 
     # Nobody behind: nobody is hindered or relieved.
@@ -86,25 +91,38 @@ def mobil_criterion(
 ) -> tuple[Tensor, Tensor]:
     """MOBIL's two criteria of a change from ``here`` [N, K, 1] to ``there`` [N, K, L].
 
-    Returns the incentive, m/s2, what the driver gains plus what its followers gain, weighted, and
-    whether the change is safe (Kesting et al. 2007): neither the new follower nor the driver brakes
-    harder than ``safe_deceleration``. ``politeness`` is a factor on both weights, [N, K, 1].
+    Args:
+        there: in the lanes to change into.
+        here: in the observer's own lane.
+        mobil: weights of the followers, and what is safe.
+        politeness: a factor on both weights, [N, K, 1] or one for all.
+
+    Returns:
+        The incentive, m/s2, what the driver gains plus what its followers gain, weighted, and
+        whether the change is safe (Kesting et al. 2007): neither the new follower nor the driver
+        brakes harder than ``safe_deceleration``. Both [N, K, L].
     """
     # What the new follower gains (mostly below 0), and what the old one gains.
     burden = there.with_it - there.without
     relief = here.without - here.with_it
+
     incentive = (
         there.observer
         - here.observer
         + politeness * mobil.politeness_side * burden
         + politeness * mobil.politeness_rear * relief
     )
+
     hardest = torch.minimum(there.with_it, there.observer)
-    return incentive, hardest >= -mobil.safe_deceleration
+    safe = hardest >= -mobil.safe_deceleration
+    return incentive, safe
 
 
 def safe_change(
-    scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: MobilParameters = TABLE_IV
+    scene: Scene,
+    lane: Tensor,
+    idm: AnyIdm = TABLE_V,
+    mobil: MobilParameters = TABLE_IV,
 ) -> Tensor:
     """MOBIL's safety criterion for a change into ``lane`` [N, K] (float), bool [N, K]."""
     # Safety does not depend on where the vehicle is now: that lane stands in for it.
@@ -121,17 +139,24 @@ def without_ego(wish: Tensor) -> Tensor:
 
 
 def one_at_a_time(
-    scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: MobilParameters = TABLE_IV
+    scene: Scene,
+    wish: Tensor,
+    idm: AnyIdm = TABLE_V,
+    mobil: MobilParameters = TABLE_IV,
 ) -> Tensor:
     """``wish`` (-1, 0, +1 lanes, [N, M]), 0 where a vehicle ahead that wants the same lane is too
     close.
 
     Too close means nearer than ``exclusive_m`` (centre to centre), or requiring unsafe braking.
     MOBIL's criteria do not cover this case, since neither vehicle is in that lane yet.
+
+    Args:
+        scene: with all vehicles as observers.
     """
     vehicles = scene.vehicles
     if not reads_are_cheap(wish):
-        return torch.where(_gives_way(vehicles, scene.road, wish, idm, mobil), 0, wish)
+        gives_way = _gives_way(vehicles, scene.road, wish, idm, mobil)
+        return torch.where(gives_way, 0, wish)
 
     # Rivals are rare: among all pairs a decision of idm_random takes 5 % longer with 1024 rows.
     wants = wish != 0
@@ -155,11 +180,16 @@ def one_at_a_time(
     granted = torch.where(gives_way, 0, asked)
 
     # Back into their columns, and these rows among all.
-    return wish.index_copy(0, rows, wishes.scatter(1, columns, granted))
+    wishes = wishes.scatter(1, columns, granted)
+    return wish.index_copy(0, rows, wishes)
 
 
 def _gives_way(
-    vehicles: Vehicles, road: Road, wish: Tensor, idm: AnyIdm, mobil: MobilParameters
+    vehicles: Vehicles,
+    road: Road,
+    wish: Tensor,
+    idm: AnyIdm,
+    mobil: MobilParameters,
 ) -> Tensor:
     """Whether a vehicle ahead that wants the same lane is too close, bool [N, M]."""
     # Two that want the same lane from its two sides do not see each other in it yet.
@@ -190,9 +220,12 @@ def falling_behind(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParamet
 
     Args:
         ways: of the observers.
+        idm: that judges whether the change is safe.
+        mobil: what is safe, and how hard it brakes.
     """
     ahead = leader(scene, _wanted_lane(scene, ways))
-    blocked = acceleration_behind(scene, ahead, idm) < -mobil.safe_deceleration
+    demand = acceleration_behind(scene, ahead, idm)
+    blocked = demand < -mobil.safe_deceleration
     return _courteous(scene, ways, blocked, mobil)
 
 
@@ -201,13 +234,15 @@ def letting_past(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameter
     makes room, m/s2, [N, K]; infinite for others.
 
     It brakes with ``courtesy`` where the follower in the lane that it has to reach makes the change
-    unsafe, until that one is so much faster as a second of this braking makes it, and goes past.
+    unsafe, until that one is faster by as much as a second of this braking makes, and goes past.
     One who stands, or brakes with more than half of ``courtesy``, makes room or waits itself: for
     that one the driver does not wait. Drivers who have to change adapt their speed to the gap
     beside them so in Hidas (2005) and Schakel, Knoop and van Arem (2012).
 
     Args:
         ways: of the observers.
+        idm: that judges whether the change is safe.
+        mobil: what is safe, and how hard it brakes.
     """
     # The follower in that lane, [N, K, 1].
     gap, index = nearest(scene, _wanted_lane(scene, ways), -1)
@@ -218,6 +253,7 @@ def letting_past(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameter
     demand = idm_acceleration(behind.speed, behind.desired_speed, gap, speed, idm.per_lane())
     unsafe = (gap < FREE_GAP_M) & (demand < -mobil.safe_deceleration)
 
+    # Whether it goes past, or would wait for the driver in its turn.
     goes_on = (behind.speed > 0.0) & (behind.acceleration > -0.5 * mobil.courtesy)
     # Braking for a second changes the speed by as much as ``courtesy`` says.
     goes_on = goes_on & (behind.speed - speed < mobil.courtesy)
@@ -241,14 +277,20 @@ def yielding(scene: Scene, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
 
     It follows the nearest vehicle ahead that has to change into its lane from one beside it, as if
     that were its leader already, but brakes for it no harder than ``courtesy``. Who has to change
-    falls behind likewise (:func:`falling_behind`). Of two who are in
-    each other's way only the one behind makes room; and one that is nearer than half of IDM's
-    least gap goes past, since nobody would change in front of it. So they cannot block one another.
+    falls behind likewise (:func:`falling_behind`).
+
+    Of two who are in each other's way only the one behind makes room; and one that is nearer than
+    half of IDM's least gap goes past, since nobody would change in front of it. So they cannot
+    block one another.
+
+    Args:
+        scene: with all vehicles as observers.
     """
     vehicles = scene.vehicles
     ways = ways_out(vehicles, scene.road, mobil.mandatory_m)
     asks = vehicles.valid & ways.asks
-    if mobil.courtesy == 0.0 or (reads_are_cheap(asks) and not bool(asks.any())):
+    nobody_asks = reads_are_cheap(asks) and not bool(asks.any())
+    if mobil.courtesy == 0.0 or nobody_asks:
         return torch.full_like(vehicles.x, torch.inf)
 
     # [N, i, j]: j is ahead of i, and asks for the lane that i keeps.
@@ -265,15 +307,15 @@ def yielding(scene: Scene, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
 
     # IDM needs finite numbers where there is none, or where one is too near to change.
     exists = torch.isfinite(gap) & (gap > 0.5 * idm.min_gap_m)
-    acceleration = idm_acceleration(
-        vehicles.speed[..., None],
-        vehicles.desired_speed[..., None],
-        torch.where(exists, gap, FREE_GAP_M).clamp_max(FREE_GAP_M),
-        torch.where(exists, slowest, 0.0),
-        idm.per_lane(),
-    )
+    speed = vehicles.speed[..., None]
+    desired = vehicles.desired_speed[..., None]
+    gap = torch.where(exists, gap, FREE_GAP_M).clamp_max(FREE_GAP_M)
+    slowest = torch.where(exists, slowest, 0.0)
+    acceleration = idm_acceleration(speed, desired, gap, slowest, idm.per_lane())
     makes_room = torch.where(exists, acceleration, torch.inf).clamp_min(-mobil.courtesy)[..., 0]
-    return torch.minimum(makes_room, falling_behind(scene, ways, idm, mobil))
+
+    falls_behind = falling_behind(scene, ways, idm, mobil)
+    return torch.minimum(makes_room, falls_behind)
 
 
 def mobil_wishes(
@@ -286,7 +328,12 @@ def mobil_wishes(
 
     None during a lane change. If both sides qualify, the one with the larger incentive, left if
     equal. Where lanes end, nobody changes into a lane that it has to leave more urgently.
-    ``politeness`` as of :func:`mobil_criterion`.
+
+    Args:
+        scene: [N, K] observers.
+        idm: of all drivers, or of each (:class:`~ganlane.sim.idm.DriverIdm`).
+        mobil: of all drivers.
+        politeness: as of :func:`mobil_criterion`.
     """
     vehicles = scene.observers
     lane = vehicles.target_lane.to(vehicles.x.dtype)[..., None]
@@ -299,19 +346,25 @@ def mobil_wishes(
 
     # Of the two changes, [N, K, 2].
     incentive, safe = mobil_criterion(there, here, mobil, politeness)
-    possible = may_change(scene.road, lane, lanes[..., 1:] - lane, vehicles.x[..., None])
+    sides = lanes[..., 1:] - lane
+    possible = may_change(scene.road, lane, sides, vehicles.x[..., None])
     if scene.road.has_lane_ends:
+        # How much the driver wants to leave its lane, and the two beside it.
         leave = bias(scene.road, lanes, vehicles.x, mobil.mandatory_bias, mobil.mandatory_m)
-        its, beside = leave[..., :1], leave[..., 1:]
+        its = leave[..., :1]
+        beside = leave[..., 1:]
         incentive = incentive + torch.where(its > beside, its, 0.0)
         possible = possible & (its >= beside)
     pays = possible & safe & (incentive > mobil.threshold)
 
+    # The better side, [N, K].
     left, right = torch.where(pays, incentive, -torch.inf).unbind(-1)
     side = torch.where(left >= right, 1, -1)
+
     # A driver decides anew only when its last change is complete.
     free = lane_change_done(vehicles, scene.road) & vehicles.valid
-    return torch.where(free & torch.isfinite(torch.maximum(left, right)), side, 0)
+    one_pays = torch.isfinite(torch.maximum(left, right))
+    return torch.where(free & one_pays, side, 0)
 
 
 def mobil_changes(

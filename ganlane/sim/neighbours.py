@@ -49,8 +49,10 @@ _NOBODY = 0x7F800000 << 32
 class Neighbour(NamedTuple):
     """The nearest vehicle of a kind, per observer and lane.
 
-    ``gap`` is bumper to bumper, m, :data:`FREE_GAP_M` without a neighbour, negative for an overlap
-    along the road; ``speed`` in m/s, the observer's own without a neighbour.
+    Attributes:
+        gap: bumper to bumper, m; :data:`FREE_GAP_M` without a neighbour, negative for an overlap
+            along the road.
+        speed: m/s; the observer's own without a neighbour.
     """
 
     gap: Tensor
@@ -60,7 +62,10 @@ class Neighbour(NamedTuple):
 class Follower(NamedTuple):
     """The nearest vehicle behind, per observer and lane.
 
-    Gap, m, speeds, m/s, and whether it exists.
+    Attributes:
+        gap: bumper to bumper, m; :data:`FREE_GAP_M` without one.
+        speed, desired_speed: m/s; anyone's without one.
+        exists: whether there is one, bool.
     """
 
     gap: Tensor
@@ -72,9 +77,11 @@ class Follower(NamedTuple):
 class Pairs(NamedTuple):
     """Every vehicle relative to every observer, [N, K, M].
 
-    ``distance`` is the signed distance between the centres, m, and ``gap`` that between the
-    bumpers, whoever is ahead. ``order`` is the distance with ties broken: of two vehicles at the
-    same x the one with the lower index is ahead.
+    Attributes:
+        distance: between the centres, m, positive for a vehicle ahead.
+        gap: between the bumpers, m, whoever is ahead.
+        order: the distance with ties broken: of two vehicles at the same x the one with the lower
+            index is ahead.
     """
 
     distance: Tensor
@@ -95,10 +102,17 @@ class Pairs(NamedTuple):
 class Scene(NamedTuple):
     """M vehicles as K observers see them, computed once per step.
 
-    ``observers`` and their lane ranges ``body`` and ``attention`` are [N, K]; ``presence`` [N, M]
-    holds the lanes in which others see each vehicle. With a ``queue`` neighbours are found by
-    sorting: int64 [N, M], the vehicles in the order of the road, the foremost first, and
-    everybody's place in that order. Without it they are found by ``compared`` pairs.
+    Attributes:
+        which: of the vehicles are the observers.
+        observers: [N, K].
+        vehicles: [N, M].
+        road: that they are on.
+        body: lanes that the body of each observer is in, [N, K].
+        attention: lanes that its driver attends to, [N, K].
+        presence: lanes in which others see each vehicle, [N, M].
+        queue: int64 [N, M], the vehicles in the order of the road, the foremost first, and
+            everybody's place in that order. With it neighbours are found by sorting.
+        compared: without a queue they are found by these pairs.
     """
 
     which: slice
@@ -128,10 +142,12 @@ def _beyond(number: Tensor, where: Tensor) -> Tensor:
 
 def compare(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Pairs:
     """The :class:`Pairs` of all vehicles as observers, or of a slice of them."""
+    # [N, K, 1] against [N, 1, M].
     distance = road.distance_ahead(vehicles.x[:, which, None], vehicles.x[:, None, :])
     # Between the bumpers: the distance of the centres less half of both lengths.
     half = 0.5 * vehicles.length
     gap = distance.abs() - (half[:, which, None] + half[:, None, :])
+
     index = torch.arange(vehicles.x.shape[1], device=vehicles.x.device)
     # In the run's float type: whole numbers times a float would be in torch's default one.
     order = torch.sign(index[which, None] - index).to(distance.dtype)
@@ -143,6 +159,8 @@ def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scen
     body = body_lanes(vehicles, road)
     attention = with_target(body, vehicles)
     x = vehicles.x
+
+    # It pays where all vehicles observe and pairs are many, and is possible where the rest holds.
     sorts = (
         which == slice(None)
         and x.shape[0] * x.shape[1] ** 2 >= SORTS_FROM
@@ -154,6 +172,7 @@ def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scen
         # keys have no gradient
         and not (x.requires_grad or vehicles.speed.requires_grad)
     )
+
     return Scene(
         which=which,
         observers=vehicles.columns(which),
@@ -195,9 +214,12 @@ def leader(scene: Scene, lane: Tensor) -> Neighbour:
         farther = ends > rear[..., None]
         its_speed = _beyond(speed[:, None, None, :], farther).amin(-1)
     else:
-        key = _nearest_key(scene, scene.queue, lanes, 1, _ordered(speed) - _INT32_MIN)
+        # The lower half of a key is not below 0.
+        second = _ordered(speed) - _INT32_MIN
+        key = _nearest_key(scene, scene.queue, lanes, 1, second)
         rear = _unordered(key >> 32)
         its_speed = _unordered((key & 0xFFFFFFFF) + _INT32_MIN)
+
     gap = _gap(scene, rear, 1)
     its_speed = torch.where(gap < FREE_GAP_M, its_speed, scene.observers.speed[..., None])
     return Neighbour(gap.view_as(lane), its_speed.view_as(lane))
@@ -212,6 +234,7 @@ def follower(scene: Scene, lane: Tensor) -> Follower:
     vehicles = scene.vehicles
     gap, index = nearest(scene, lanes, -1)
     gap = gap.view_as(lane)
+
     # What else is known of the vehicle that was found.
     flat = index.flatten(1)
     speed = vehicles.speed.gather(1, flat).view_as(lane)
@@ -231,8 +254,9 @@ def nearest(scene: Scene, lanes: Tensor, side: int) -> tuple[Tensor, Tensor]:
         numbers = torch.arange(scene.vehicles.x.shape[1], device=lanes.device)
         key = _nearest_key(scene, scene.queue, lanes, side, numbers)
         end = _unordered(key >> 32)
-        # Nobody's key has no number in it.
+        # Nobody's key has the index 0.
         index = key & 0xFFFFFFFF
+
     return _gap(scene, end, side), index
 
 
@@ -249,6 +273,7 @@ def _candidates(scene: Scene, lanes: Tensor, side: int) -> Tensor:
     pairs = scene.pairs
     x = v.x[:, None, :] if scene.road.ring_m is None else pairs.distance
     end = side * x - (0.5 * v.length)[:, None, :]
+
     elsewhere = pairs.order <= 0 if side > 0 else pairs.order >= 0
     # In two steps: leader and follower in several lanes then share the first, [N, K, M], which a
     # compiler keeps. In one step compiled idm_mobil took twice as long.
@@ -269,14 +294,22 @@ def _gap(scene: Scene, end: Tensor, side: int) -> Tensor:
 
 
 def _queue(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Of vehicles at ``x`` [N, M]; of two at the same x the one with the lower index is ahead."""
+    """The order of vehicles at ``x`` [N, M] and their places in it, int64 [N, M] each.
+
+    Of two at the same x the one with the lower index is ahead.
+    """
     turn = x.sort(dim=1, descending=True, stable=True).indices
     numbers = torch.arange(x.shape[1], device=x.device).expand_as(turn)
-    return turn, torch.empty_like(turn).scatter_(1, turn, numbers)
+    place = torch.empty_like(turn).scatter_(1, turn, numbers)
+    return turn, place
 
 
 def _nearest_key(
-    scene: Scene, queue: tuple[Tensor, Tensor], lane: Tensor, side: int, second: Tensor
+    scene: Scene,
+    queue: tuple[Tensor, Tensor],
+    lane: Tensor,
+    side: int,
+    second: Tensor,
 ) -> Tensor:
     """The key of the vehicle with the nearest end in each lane [N, K, L], ahead (``side`` 1) or
     behind (-1).
@@ -284,24 +317,36 @@ def _nearest_key(
     A key is 64 bits long: first the end as in :func:`_candidates`, then ``second``, which decides
     between level ends. So a minimum of keys finds the neighbour and holds what is to be known of
     it.
+
+    Args:
+        queue: as of :class:`Scene`.
+        second: of each vehicle, [N, M] int64, 0 to 2^32 - 1.
     """
-    v, (turn, place), count = scene.vehicles, queue, lane.shape[1]
+    v = scene.vehicles
+    turn, place = queue
+    count = lane.shape[1]
     lanes = scene.road.lanes
     if isinstance(lanes, Tensor):
         lanes = int(lanes.max())
-    if side < 0:  # from the rear
+    if side < 0:
+        # From the rear.
         turn = turn.flip(1)
         place = count - 1 - place
+
     # Everybody's near end, in the order of the road.
     end = _ordered(side * v.x - 0.5 * v.length)
     key = ((end << 32) | second).gather(1, turn)
-    low, high = (end.gather(1, turn) for end in scene.presence)
+    low = scene.presence.low.gather(1, turn)
+    high = scene.presence.high.gather(1, turn)
+
     number = torch.arange(lanes, device=v.x.device)[:, None, None]
     # [lanes, N, M]: everybody's key in the lanes that it is seen in.
     key = torch.where((low <= number) & (number <= high), key, _NOBODY)
+
     # Entry k of a lane: the nearest among the first k in the queue; among none it is nobody.
     before = pad(key[..., :-1], (1, 0), value=_NOBODY)
     nearest = before.cummin(-1).values.transpose(0, 1).flatten(1)
+
     # Place of the observer's entry: lane by lane, as many entries as vehicles.
     entry = lane.clamp(0, lanes - 1).long() * count + place[..., None]
     neighbour = nearest.gather(1, entry.flatten(1)).view_as(lane)
@@ -314,10 +359,12 @@ def _ordered(number: Tensor) -> Tensor:
     The bits of floats above 0 order as whole numbers do; those below 0 the other way round, so all
     their bits but the sign are turned over. :func:`_unordered` undoes it.
     """
-    bits = (number + 0.0).view(torch.int32)  # -0 becomes 0
+    # -0 becomes 0.
+    bits = (number + 0.0).view(torch.int32)
     return (bits ^ ((bits >> 31) & 0x7FFFFFFF)).long()
 
 
 def _unordered(whole: Tensor) -> Tensor:
+    """The float32 of a whole number of :func:`_ordered`."""
     bits = whole.int()
     return (bits ^ ((bits >> 31) & 0x7FFFFFFF)).view(torch.float32)

@@ -29,7 +29,11 @@ def stalled(x_m: float, lane: int, lane_width_m: float) -> SceneVehicle:
 
 
 def cut_in(
-    gap_m: float, speed_mps: float, cutter_speed_mps: float, lanes: int, desired_speed_mps: float
+    gap_m: float,
+    speed_mps: float,
+    cutter_speed_mps: float,
+    lanes: int,
+    desired_speed_mps: float,
 ) -> SceneVehicles:
     """A slower vehicle one lane to the left, ``gap_m`` ahead of the ego's bumper, moves into its
     lane at once.
@@ -39,10 +43,14 @@ def cut_in(
     reaction.
     """
     _needs_two(lanes, "cut_in")
-    # Next to the leftmost, from which the other vehicle comes.
-    lane = lanes - 2  # the ego's
+    # The ego's lane is next to the leftmost, from which the other vehicle comes.
+    lane = lanes - 2
     cutter = SceneVehicle(
-        gap_m + LENGTH_M, lane + 1, cutter_speed_mps, cutter_speed_mps, target_lane=lane
+        gap_m + LENGTH_M,
+        lane + 1,
+        cutter_speed_mps,
+        cutter_speed_mps,
+        target_lane=lane,
     )
     cars = [
         SceneVehicle(0.0, lane, speed_mps, desired_speed_mps),
@@ -51,6 +59,7 @@ def cut_in(
         SceneVehicle(-35.0, lane, speed_mps, 22.0),
         SceneVehicle(-40.0, lane + 1, speed_mps, 24.0),
     ]
+
     # On two lanes the ego is in the rightmost.
     if lane > 0:
         cars.append(SceneVehicle(-8.0, lane - 1, speed_mps, speed_mps))
@@ -98,6 +107,8 @@ def blocked_lane(
     for number in range(standing):
         # 1.5 m from bumper to bumper: no gap to slip into.
         cars.append(stalled(distance_m + (LENGTH_M + 1.5) * number, 0, lane_width_m))
+
+    # One behind the ego, and the traffic of the open lanes.
     cars.append(SceneVehicle(-50.0, 0, speed_mps, 20.0))
     for lane in range(1, lanes):
         cars += _column(lane, 6, 1.3 * spacing_m, spacing_m, speed_mps, 20.0)
@@ -142,14 +153,18 @@ def stop_and_go(
     queue = LENGTH_M + idm.min_gap_m
     # Five seconds away, so that the group has time to brake.
     approach = 5.0 * speed_mps
+
+    # Of every vehicle: its speed, and its distance to the one ahead of it.
     speeds = [speed_mps] * 2
     spacings = [0.0, steady]
     for _ in range(waves):
         speeds += [0.0] * per_wave + [speed_mps] * per_wave
         spacings += [steady] + [queue] * (per_wave - 1)
         spacings += [approach] + [steady] * (per_wave - 1)
+
     # From the head of the column backwards.
     column = [(-x, speed) for x, speed in zip(accumulate(spacings), speeds, strict=True)]
+
     # The last but one: somebody behind it can run into it.
     ego_x, ego_speed = column[-2]
     cars = [SceneVehicle(ego_x, 0, ego_speed, desired_speed_mps)]
@@ -236,6 +251,7 @@ def _around(
         first_m = (ahead + 0.5 * (abs(lane - ego.lane) % 2)) * spacing_m
         speed = speed_mps + faster_mps * (lane - 1)
         stream = _column(lane, vehicles, first_m, spacing_m, speed)
+        # The ego is at x = 0.
         cars += [car for car in stream if car.x_m or lane != ego.lane]
     return tuple(cars)
 

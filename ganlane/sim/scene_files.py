@@ -38,7 +38,14 @@ _MOST_BYTES = 2**24
 
 @dataclass(frozen=True)
 class SceneFile(Record):
-    """What a file says of a scene; None and empty: nothing."""
+    """What a file says of a scene; None and empty: nothing.
+
+    Attributes:
+        vehicles: the ego first.
+        lanes: of its road.
+        lane_width_m: of its road, m.
+        stretches: where its lanes begin and end, from the right, m.
+    """
 
     vehicles: SceneVehicles
     lanes: Count | None = None
@@ -47,7 +54,9 @@ class SceneFile(Record):
 
 
 def read_scene(
-    path: str | Path, lanes: int | None = None, lane_width_m: float | None = None
+    path: str | Path,
+    lanes: int | None = None,
+    lane_width_m: float | None = None,
 ) -> FixedScene:
     """The scene in a CSV or JSON file; ``replace`` sets its jitter and visibility.
 
@@ -64,13 +73,16 @@ def read_scene(
     text = _text(path, "a scene", (".csv", ".json"))
     file = _read_csv(path, text) if path.suffix.lower() == ".csv" else _read_json(path, text)
     rows = file.vehicles
-    # The file's numbers hold unless it gives none.
-    width = _agreed(path, "lane_width_m", file.lane_width_m, lane_width_m) or LANE_WIDTH_M
     stretches = file.stretches
+
+    # Width and lanes as in the file or as asked for; without either, what fits.
+    width = _agreed(path, "lane_width_m", file.lane_width_m, lane_width_m) or LANE_WIDTH_M
     count = _agreed(path, "lanes", file.lanes, lanes) or len(stretches) or _lanes_in(rows, width)
+
     if rows:
         # The ego starts at 0, wherever the file has it.
         stretches = tuple(stretch.seen_from(rows[0].x_m) for stretch in stretches)
+
     try:
         road = Road(int(count), float(width), stretches=stretches)
     except UserError as error:
@@ -91,17 +103,28 @@ def read_roads(path: str | Path) -> dict[str, Stretches]:
     content = _json(path, _text(path, "roads", (".json",)))
     if not isinstance(content, dict):
         raise UserError(f"{path}: expected an object of scenes; see docs/traffic.md.")
+
     return {scene: _stretches(lanes, f"{path}: {scene}") for scene, lanes in content.items()}
 
 
 def with_ego_speed(scene: FixedScene, desired_speed_mps: float) -> FixedScene:
     """The scene with another desired speed of the ego, m/s."""
     ego, *others = scene.rows
-    return replace(scene, rows=(replace(ego, desired_speed_mps=desired_speed_mps), *others))
+    ego = replace(ego, desired_speed_mps=desired_speed_mps)
+    return replace(scene, rows=(ego, *others))
 
 
 def _text(path: Path, what: str, endings: Sequence[str]) -> str:
-    """The file's text; ``what`` it should hold, for messages."""
+    """The file's text.
+
+    Args:
+        path: the file.
+        what: it should hold, for messages.
+        endings: its name may have.
+
+    Raises:
+        UserError: no such file, another ending, too large, or not UTF-8.
+    """
     expected = " or ".join(endings)
     if not path.is_file():
         raise UserError(f"{path}: no such file; give {what} as {expected}.")
@@ -113,6 +136,7 @@ def _text(path: Path, what: str, endings: Sequence[str]) -> str:
         raise UserError(
             f"{path}: more than {_MOST_BYTES} bytes, too much for {what}; give a smaller file."
         )
+
     try:
         # utf-8-sig, since spreadsheets write a byte order mark.
         return path.read_text(encoding="utf-8-sig")
@@ -123,6 +147,7 @@ def _text(path: Path, what: str, endings: Sequence[str]) -> str:
 
 
 def _json(path: Path, text: str) -> Any:
+    """What JSON says; raises :class:`UserError` for other text."""
     try:
         return json.loads(text)
     # A ValueError without a place in the file: a whole number of thousands of digits.
@@ -134,15 +159,18 @@ def _stretches(lanes: Any, where: str) -> Stretches:
     """The stretches of a road's lanes, from the right."""
     if not isinstance(lanes, list) or not lanes:
         raise UserError(f"{where}: expected a list with an object for each lane, from the right.")
-    return tuple(
-        _made(LaneStretch, lane, f"{where}, lane {number}") for number, lane in enumerate(lanes)
-    )
+
+    stretches = []
+    for number, lane in enumerate(lanes):
+        stretches.append(_made(LaneStretch, lane, f"{where}, lane {number}"))
+    return tuple(stretches)
 
 
 def _made(kind: type[Made], values: Any, where: str) -> Made:
-    """A record of what a file has at a place."""
+    """A record of what a file has at a place; raises :class:`UserError` for wrong values."""
     if not isinstance(values, dict):
         raise UserError(f"{where}: expected an object with {', '.join(key_names(kind))}.")
+
     # Null is as no value.
     numbers = {name: _number(value) for name, value in values.items() if value is not None}
     try:
@@ -182,6 +210,8 @@ def _lanes_in(rows: Sequence[SceneVehicle], lane_width_m: float) -> int:
 
 
 def _read_csv(path: Path, text: str) -> SceneFile:
+    """A scene from CSV: a header, then a line per vehicle."""
+    # Lines with something in them: where they are, in messages and in labels, and what they say.
     lines = []
     # Numbers of lines count comments and empty lines too, as an editor does.
     for number, line in enumerate(text.split("\n"), 1):
@@ -192,8 +222,9 @@ def _read_csv(path: Path, text: str) -> SceneFile:
             f"{path}: empty; expected a header with {', '.join(COLUMNS)}, and a line per vehicle."
         )
     check_count(str(path), len(lines) - 1)
-    where, _, line = lines[0]
+
     # The first line that is no comment.
+    where, _, line = lines[0]
     header = _cells(line, where)
     for name in header:
         if name not in COLUMNS:
@@ -207,6 +238,7 @@ def _read_csv(path: Path, text: str) -> SceneFile:
             f"{where}: columns x_m and lane (or y_m) are needed; the header has "
             f"{', '.join(header)}."
         )
+
     rows = []
     for where, origin, line in lines[1:]:
         cells = _cells(line, where)
@@ -214,6 +246,7 @@ def _read_csv(path: Path, text: str) -> SceneFile:
             raise UserError(
                 f"{where}: {len(cells)} cells, the header has {len(header)}; fix the line."
             )
+
         # An empty cell is as a column that is not there: the default.
         values = {name: cell for name, cell in zip(header, cells) if cell}
         rows.append(_vehicle(values, where, origin))
@@ -221,6 +254,7 @@ def _read_csv(path: Path, text: str) -> SceneFile:
 
 
 def _cells(line: str, where: str) -> list[str]:
+    """The cells of a line of CSV, without spaces around them."""
     try:
         # Line by line, so that a mistake has a line number; no cell spans two lines.
         return [cell.strip() for cell in next(csv.reader([line]))]
@@ -229,6 +263,7 @@ def _cells(line: str, where: str) -> list[str]:
 
 
 def _read_json(path: Path, text: str) -> SceneFile:
+    """A scene from JSON: a list of vehicles, or an object that has one and maybe a road."""
     content = _json(path, text)
     # A bare list of vehicles is short for an object without a road.
     if isinstance(content, list):
@@ -239,9 +274,12 @@ def _read_json(path: Path, text: str) -> SceneFile:
             "see docs/scenarios.md."
         )
     check_count(str(path), len(content["vehicles"]))
+
+    # The lists of objects become lists of records.
     rows = []
     for number, vehicle in enumerate(content["vehicles"], 1):
-        rows.append(_vehicle(vehicle, f"{path}: vehicles entry {number}", f"entry {number}"))
+        where = f"{path}: vehicles entry {number}"
+        rows.append(_vehicle(vehicle, where, f"entry {number}"))
     content["vehicles"] = rows
     if content.get("stretches") is not None:
         content["stretches"] = _stretches(content["stretches"], f"{path}: stretches")
@@ -249,16 +287,27 @@ def _read_json(path: Path, text: str) -> SceneFile:
 
 
 def _vehicle(values: Any, where: str, origin: str) -> SceneVehicle:
-    """A vehicle from its values in a file."""
+    """A vehicle from its values in a file.
+
+    Args:
+        values: by the names of the columns.
+        where: they are, for messages of errors here.
+        origin: the same within the file, for messages about the vehicle later on.
+    """
+    # What is no dict is refused with the names of the columns, below.
     if isinstance(values, dict):
         if values.get("x_m") is None:
             raise UserError(f"{where}: x_m: no value; give the position along the road in m.")
+
+        # Files name a visibility, the record has its number.
         kinds = {kind.name.lower(): kind for kind in Visibility}
-        seen = values.get("visibility")
-        if seen is not None:
-            if not isinstance(seen, str) or seen not in kinds:
+        name = values.get("visibility")
+        if name is not None:
+            if not isinstance(name, str) or name not in kinds:
                 raise UserError(
-                    f"{where}: visibility={as_typed(seen):.60}: expected one of {', '.join(kinds)}."
+                    f"{where}: visibility={as_typed(name):.60}: expected one of {', '.join(kinds)}."
                 )
-            values = values | {"visibility": kinds[seen]}
-    return replace(_made(SceneVehicle, values, where), origin=origin)
+            values = values | {"visibility": kinds[name]}
+
+    vehicle = _made(SceneVehicle, values, where)
+    return replace(vehicle, origin=origin)

@@ -156,16 +156,18 @@ class FixedScene:
 
         Those who wait outside are out of everybody's way.
         """
-        lanes = self.road.lanes
-        width = self.road.lane_width_m
         if self.road != road:
+            lanes = self.road.lanes
+            width = self.road.lane_width_m
             ring = " and is a ring" if road.ring_m else ""
             raise UserError(
                 f"{self.name}: laid out for a straight road of {lanes} lanes of {width:g} m, the "
                 f"traffic's has {road.lanes} of {road.lane_width_m} m{ring}; give both the same "
                 "road."
             )
-        present = replace(self, rows=self.rows[: self.vehicles - self.waiting], waiting=0)
+
+        on_road = self.rows[: self.vehicles - self.waiting]
+        present = replace(self, rows=on_road, waiting=0)
         check_braking(present, idm)
         check_drive(present, idm)
 
@@ -174,50 +176,61 @@ class FixedScene:
         n = key.shape[0]
         m = self.vehicles
         base = self.base(dtype, key.device)
+
         # Copied, since the rows of an expanded tensor share memory.
         whole = Vehicles(*(value.expand(n, m).clone() for value in base))
         if self.jitter_m == 0 and self.jitter_mps == 0:
             return whole
-        # From [0, 1) to [-1, 1).
-        u = 2.0 * uniform(key, 0, m, [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED], dtype) - 1.0
+
+        # From [0, 1) to [-1, 1), [N, M, 2].
+        purposes = [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED]
+        u = 2.0 * uniform(key, 0, m, purposes, dtype) - 1.0
+
         # Only the others are shifted: the ego stays at x = 0.
         x = torch.where(whole.is_ego(), whole.x, whole.x + self.jitter_m * u[..., 0])
+
         varied = (whole.speed + self.jitter_mps * u[..., 1]).clamp_min(0.0)
         # Who stands remains standing.
         speed = torch.where(whole.speed > 0, varied, whole.speed)
         return whole.with_(x=x, speed=speed)
 
     def base(
-        self, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+        self,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | None = None,
     ) -> Vehicles:
         """The scene without jitter, fields [1, M]."""
         rows = self.rows
         road = self.road
 
-        def column(values: Sequence[float], kind: torch.dtype = dtype) -> Tensor:
+        def row_of(values: Sequence[float], kind: torch.dtype = dtype) -> Tensor:
+            """A number of each vehicle as [1, M]."""
             return torch.tensor([values], dtype=kind, device=device)
 
-        targets = []
-        seen = []
         # What a row leaves out follows from the scene.
+        targets = []
+        visibilities = []
         usual = [self.ego_visibility] + [self.others_visibility] * (len(rows) - 1)
         for row, kind in zip(rows, usual):
             targets.append(row.lane_on(road) if row.target_lane is None else row.target_lane)
-            seen.append(kind if row.visibility is None else row.visibility)
+            visibilities.append(kind if row.visibility is None else row.visibility)
+
+        # Those who wait are the last ones.
+        present = len(rows) - self.waiting
         # Vehicles of a scene start straight, at a constant speed.
-        zero = column([0.0] * len(rows))
+        zero = row_of([0.0] * len(rows))
         return Vehicles(
-            x=column([row.x_m - rows[0].x_m for row in rows]),
-            y=column([row.y_on(road) for row in rows]),
+            x=row_of([row.x_m - rows[0].x_m for row in rows]),
+            y=row_of([row.y_on(road) for row in rows]),
             heading=zero,
-            speed=column([row.speed_mps for row in rows]),
+            speed=row_of([row.speed_mps for row in rows]),
             acceleration=zero,
-            length=column([row.length_m for row in rows]),
-            width=column([row.width_m for row in rows]),
-            desired_speed=column([row.desired_speed_mps for row in rows]),
-            target_lane=column(targets, torch.int64),
-            visibility=column(seen, torch.int64),
-            valid=torch.arange(len(rows), device=device)[None] < len(rows) - self.waiting,
+            length=row_of([row.length_m for row in rows]),
+            width=row_of([row.width_m for row in rows]),
+            desired_speed=row_of([row.desired_speed_mps for row in rows]),
+            target_lane=row_of(targets, torch.int64),
+            visibility=row_of(visibilities, torch.int64),
+            valid=torch.arange(len(rows), device=device)[None] < present,
         )
 
     def label(self, index: int) -> str:
@@ -228,22 +241,29 @@ class FixedScene:
 
 
 def with_waiting(rows: SceneVehicles, road: Road) -> SceneVehicles:
-    """``rows``, and with a flow its slots: drivers like the others of the scene in turn, beyond the
-    end of the section at their desired speeds, in a lane that goes on.
+    """``rows``, and with a flow the vehicles that wait outside at the start, one in each slot.
+
+    They are drivers like the others of the scene in turn, beyond the end of the section at their
+    desired speeds, in a lane that goes on.
     """
     flow = road.flow
     if flow is None:
         return rows
+
     ends = [its.end for its in road.stretches]
     lane = ends.index(NOTHING)
     waiting = []
     for slot in range(flow.slots):
         like = rows[1 + slot % (len(rows) - 1)]
-        speed = like.desired_speed_mps
-        x_m = flow.to_m + SLOT_M * (slot + 1)
-        waiting.append(
-            replace(like, x_m=x_m, y_m=None, lane=lane, target_lane=lane, speed_mps=speed)
+        vehicle = replace(
+            like,
+            x_m=flow.to_m + SLOT_M * (slot + 1),
+            y_m=None,
+            lane=lane,
+            target_lane=lane,
+            speed_mps=like.desired_speed_mps,
         )
+        waiting.append(vehicle)
     return (*rows, *waiting)
 
 
@@ -266,21 +286,26 @@ def check_rows(scene: FixedScene) -> None:
             f"{scene.name}: {len(scene.rows)} vehicles; a scene needs the ego and at least one "
             "other."
         )
-    if not isinstance(scene.road.lanes, int) or isinstance(scene.road.lane_width_m, Tensor):
+
+    lanes = scene.road.lanes
+    width = scene.road.lane_width_m
+    if not isinstance(lanes, int) or isinstance(width, Tensor):
         raise UserError(
             f"{scene.name}: a scene set by hand needs one road for all episodes, not one per row."
         )
     # Written so that NaN is refused: every comparison with it is false.
-    if not (1 <= scene.road.lanes <= MOST_LANES and SMALLEST <= scene.road.lane_width_m <= LARGEST):
+    if not (1 <= lanes <= MOST_LANES and SMALLEST <= width <= LARGEST):
         raise UserError(
-            f"{scene.name}: a road of {scene.road.lanes:g} lanes of {scene.road.lane_width_m:g} m; "
+            f"{scene.name}: a road of {lanes:g} lanes of {width:g} m; "
             f"expected 1 to {MOST_LANES} of at most {LARGEST:g} m."
         )
+
     if not all(0 <= jitter <= LARGEST for jitter in (scene.jitter_m, scene.jitter_mps)):
         raise UserError(
             f"{scene.name}: jitter_m={scene.jitter_m:g}, jitter_mps={scene.jitter_mps:g}: "
             "expected at least 0."
         )
+
     for index, row in enumerate(scene.rows):
         fault = _fault(row, scene.road)
         if fault:
@@ -298,6 +323,7 @@ def _fault(row: SceneVehicle, road: Road) -> str:
     for name in ("desired_speed_mps", "length_m", "width_m"):
         if getattr(row, name) < SMALLEST:
             return f"{name}={getattr(row, name):g}: expected a number above 0"
+
     # Then the place across the road: on it, in its lane, and next to its target lane.
     lanes = int(road.lanes)
     if row.lane is None and row.y_m is None:
@@ -305,15 +331,18 @@ def _fault(row: SceneVehicle, road: Road) -> str:
     for name, lane in (("lane", row.lane), ("target_lane", row.target_lane)):
         if lane is not None and not 0 <= lane < lanes:
             return f"{name}={lane}: expected 0 to {lanes - 1}, the road has {lanes} lanes"
+
     right = float(road.right_edge_m())
     left = float(road.left_edge_m())
     y = row.y_on(road)
+    half_m = 0.5 * row.width_m
     # 1e-6 m for rounding.
-    if y - 0.5 * row.width_m < right - 1e-6 or y + 0.5 * row.width_m > left + 1e-6:
+    if y - half_m < right - 1e-6 or y + half_m > left + 1e-6:
         return (
             f"y={y:g} m, width {row.width_m:g} m: expected on the road, which runs from "
             f"{right:g} to {left:g} m"
         )
+
     # A lane that contradicts the position would be a lane change nobody asked for.
     here = row.lane_on(road)
     if row.lane is not None and row.lane != here:
@@ -328,6 +357,7 @@ def _fault(row: SceneVehicle, road: Road) -> str:
 def check_overlaps(scene: FixedScene) -> None:
     """Raise :class:`UserError` if two vehicles overlap, or may do so with the largest jitter."""
     vehicles = scene.base()
+
     # Two vehicles may both be shifted, towards each other: each counts as longer by twice the
     # shift.
     longer = torch.full_like(vehicles.x, 2.0 * scene.jitter_m)
@@ -335,6 +365,7 @@ def check_overlaps(scene: FixedScene) -> None:
     longer[:, 0] = 0.0
     longest = vehicles.with_(length=vehicles.length + longer)
     hits = pair_overlaps(longest, scene.road)[0].nonzero().tolist()
+
     # The first pair is named; users mend one after the other.
     if hits:
         one, other = hits[0]
@@ -351,20 +382,27 @@ def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
     Leaders are all vehicles ahead in a lane that the follower is in or moving to; they are taken to
     keep their speed. Jitter is taken at its worst.
     """
+    # [1, i, j] below: i may have to brake for j.
     vehicles = scene.base()
     seen = perceive(vehicles, scene.road)
+
     # Leaders in the lane that a vehicle is in, and in the one it is moving to.
     shares = in_lane(seen, seen.attention.low) | in_lane(seen, seen.attention.high)
     ahead = shares & (vehicles.x[:, None, :] > vehicles.x[:, :, None])
-    varied = (vehicles.speed > 0) * scene.jitter_mps
+
     # Two shifted vehicles come closer by twice the jitter, a shifted one and the ego by once.
     slack = scene.jitter_m * (2.0 - vehicles.is_ego().double())
     gap = seen.pairs.ahead - torch.minimum(slack[:, None], slack[None, :])
+
+    # Who stands remains standing.
+    varied = (vehicles.speed > 0) * scene.jitter_mps
     fastest = vehicles.speed + varied
     slowest = (vehicles.speed - varied).clamp_min(0.0)
     # The fastest follower behind the slowest leader at the smallest gap.
     needed = needed_deceleration(fastest[:, :, None], slowest[:, None, :], gap)
     needed = torch.where(ahead, needed, 0.0)[0]
+
+    # The hardest braking is named.
     if bool((needed > -idm.min_acceleration).any()):
         one, other = divmod(int(needed.argmax()), scene.vehicles)
         raise UserError(
@@ -379,30 +417,36 @@ def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
 def check_drive(scene: FixedScene, idm: IdmParameters) -> None:
     """Raise :class:`UserError` if vehicles that follow and finish their lane changes collide."""
     hit = _first_overlap(scene, idm)
-    if hit is not None:
-        one, other, seconds = hit
-        raise UserError(
-            f"{scene.name}: {scene.label(one)} and {scene.label(other)} crash after "
-            f"{seconds:.1f} s although all brake as IDM says; move them apart, slow the rear one "
-            "down, or let a lane change be seen (signalled)."
-        )
+    if hit is None:
+        return
+    one, other, seconds = hit
+    raise UserError(
+        f"{scene.name}: {scene.label(one)} and {scene.label(other)} crash after "
+        f"{seconds:.1f} s although all brake as IDM says; move them apart, slow the rear one "
+        "down, or let a lane change be seen (signalled)."
+    )
 
 
 @lru_cache(maxsize=64)
 def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, float] | None:
     """The first two vehicles that overlap and the time, s; None without an overlap."""
-    # Fewer of large scenes, for which every pair of vehicles is looked at.
+    # Episodes of the training stream; fewer of large scenes, for which every pair of vehicles is
+    # looked at.
     most = max(1, MOST_VEHICLES**2 // scene.vehicles**2)
     # Without jitter all episodes are the same, and one drive tells.
     rows = min(DRIVES, most) if scene.jitter_m or scene.jitter_mps else 1
-    numbers = torch.arange(rows)
-    v = scene(episode_key(Stream.TRAIN, torch.zeros_like(numbers), numbers), torch.float64)
+    episodes = torch.arange(rows)
+    key = episode_key(Stream.TRAIN, torch.zeros_like(episodes), episodes)
+    v = scene(key, torch.float64)
+
+    # Everybody follows and steers to its target lane; nobody decides anything.
     steering = torch.zeros_like(v.x)
     centre = scene.road.centre_of(v.target_lane, v.y.dtype)
-    for step in range(1, round(DRIVE_S / PHYSICS_STEP_S) + 1):
-        # Everybody follows and steers to its target lane; nobody decides anything.
+    steps = round(DRIVE_S / PHYSICS_STEP_S)
+    for step in range(1, steps + 1):
         acceleration = following_acceleration(perceive(v, scene.road), idm)
         v, steering = drive(v, acceleration, steering, centre, PHYSICS_STEP_S)
+
         hits = pair_overlaps(v, scene.road)
         if bool(hits.any()):
             _, one, other = hits.nonzero()[0].tolist()

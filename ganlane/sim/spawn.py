@@ -18,10 +18,23 @@ from ganlane.errors import ParameterError, UserError
 from ganlane.keys import EGO_INDEX
 from ganlane.settings.driving import IdmParameters, Visibility
 from ganlane.settings.episode import SpawnParameters
-from ganlane.sim.idm import TABLE_V, can_brake, highest_speed, idm_acceleration, least_gap
+from ganlane.sim.idm import (
+    TABLE_V,
+    can_brake,
+    highest_speed,
+    idm_acceleration,
+    least_gap,
+)
 from ganlane.sim.neighbours import FREE_GAP_M, compare
 from ganlane.sim.random import Purpose, draw_keys, in_range, uniform
-from ganlane.sim.state import STRAIGHT, LaneRange, Road, Vehicles, body_lanes, with_target
+from ganlane.sim.state import (
+    STRAIGHT,
+    LaneRange,
+    Road,
+    Vehicles,
+    body_lanes,
+    with_target,
+)
 
 TABLE_II = SpawnParameters()
 #: Range of the positions in Table III, m.
@@ -35,15 +48,29 @@ SIDE_M = 0.4
 
 
 def check_start(
-    parameters: SpawnParameters, vehicles: int, lanes: int, idm: IdmParameters = TABLE_V
+    parameters: SpawnParameters,
+    vehicles: int,
+    lanes: int,
+    idm: IdmParameters = TABLE_V,
 ) -> None:
-    """Raise :class:`ParameterError` if ``vehicles`` do not fit, overlap, or cannot brake."""
+    """Check that random scenes are possible and safe.
+
+    Args:
+        parameters: of the scenes.
+        vehicles: M, the ego included.
+        lanes: of the road.
+        idm: how hard a follower can brake.
+
+    Raises:
+        ParameterError: the vehicles do not fit, overlap, or cannot brake in time.
+    """
     p = parameters
     if p.min_spacing_m <= p.length_m:
         raise ParameterError(
             f"{{min_spacing_m}}={p.min_spacing_m:g} is not above the vehicles' length of "
             f"{p.length_m:g} m: they would overlap; choose a larger spacing."
         )
+
     capacity = p.lane_capacity()
     if vehicles > lanes * capacity:
         lorries = f", {{truck_length_m}}={p.truck_length_m:g}" if p.truck_share > 0 else ""
@@ -52,60 +79,79 @@ def check_start(
             f"({{spread_m}}={p.spread_m:g}, {{min_spacing_m}}={p.min_spacing_m:g}{lorries}) "
             f"hold {lanes * capacity}; use fewer vehicles, more lanes or a larger {{spread_m}}."
         )
+    if vehicles < 2:
+        # Nobody follows anybody.
+        return
+
     # The fastest vehicle must avoid the slowest leader, at the smallest gap, when it brakes at the
     # limit. That gap is the same whichever vehicles are lorries (SpawnParameters.spacing_m).
     gap = p.min_spacing_m - p.length_m
-    for field, speed, leader, desired in p.worst_followers() if vehicles > 1 else ():
-        if not can_brake(gap, speed, leader, desired, idm):
-            spacing = p.length_m + least_gap(speed, leader, desired, idm)
-            slower = highest_speed(gap, leader, desired, idm)
-            raise ParameterError(
-                f"{{min_spacing_m}}={p.min_spacing_m:g} is too little for {{{field}}} up to "
-                f"{speed:g} m/s: a gap of {gap:g} m is too short to avoid a leader of {leader:g} "
-                f"m/s that brakes at {{idm.min_acceleration}}={idm.min_acceleration:g} m/s2; raise "
-                f"{{min_spacing_m}} to {spacing:.1f} or lower {{{field}}} to {slower:.1f}."
-            )
+    for field, speed, leader, desired in p.worst_followers():
+        if can_brake(gap, speed, leader, desired, idm):
+            continue
+        spacing = p.length_m + least_gap(speed, leader, desired, idm)
+        slower = highest_speed(gap, leader, desired, idm)
+        raise ParameterError(
+            f"{{min_spacing_m}}={p.min_spacing_m:g} is too little for {{{field}}} up to "
+            f"{speed:g} m/s: a gap of {gap:g} m is too short to avoid a leader of {leader:g} "
+            f"m/s that brakes at {{idm.min_acceleration}}={idm.min_acceleration:g} m/s2; raise "
+            f"{{min_spacing_m}} to {spacing:.1f} or lower {{{field}}} to {slower:.1f}."
+        )
 
 
 def draw_lanes(key: Tensor, vehicles: int, lanes: int, capacity: int) -> Tensor:
     """A random lane for each vehicle, [N, vehicles] int64, at most ``capacity`` in each.
 
-    All places of all lanes are shuffled and the first ``vehicles`` of them taken.
+    All places of all lanes are shuffled and the first ``vehicles`` of them taken. ``key`` [N] int64
+    is that of the episodes.
     """
     # A random key for every place; the lowest ones are taken.
     places = draw_keys(key, 0, lanes * capacity, [Purpose.SPAWN_LANE])[..., 0]
-    return places.argsort(dim=1, stable=True)[:, :vehicles] // capacity
+    shuffled = places.argsort(dim=1, stable=True)
+    return shuffled[:, :vehicles] // capacity
 
 
 def place_in_lanes(lane: Tensor, u: Tensor, spread_m: float, spacing_m: float) -> Tensor:
     """Positions in m, [N, M].
 
     In a lane of k sorted uniforms on [0, spread - spacing (k - 1)] plus spacing * rank.
+
+    Args:
+        lane: of each vehicle, [N, M].
+        u: uniform numbers in [0, 1), [N, M].
+        spread_m: length of the section in which they are placed, m.
+        spacing_m: least distance of two in one lane, centre to centre, m.
     """
     # Sorted uniforms plus spacings: uniform among all placings that keep the spacing.
     same = lane[:, :, None] == lane[:, None, :]
+
     # In the run's float type: whole numbers times a float would be in torch's default one.
     count = same.sum(-1).to(u.dtype)
     room = spread_m - spacing_m * (count - 1)
+
     # By counting, not by sorting: a few vehicles, and a fixed order for equal values.
     index = torch.arange(u.shape[1], device=u.device)
     mine = u[:, :, None]
     other = u[:, None, :]
+    # [N, i, j]: j is placed before i.
     before = (other < mine) | ((other == mine) & (index < index[:, None]))
     rank = (before & same).sum(-1).to(u.dtype)
     return u * room + spacing_m * rank
 
 
 def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:
-    """Order by position, but with the vehicle of rank (M - 1) // 2, the ego, first.
+    """``x``, m, and ``lane`` [N, M] in the order of position, but with the ego first, at x = 0.
 
-    Shift the ego to x = 0.
+    The ego is the vehicle of rank (M - 1) // 2.
     """
     # The vehicle in the middle becomes the ego, with as many ahead as behind.
     order = x.argsort(dim=1, stable=True)
     middle = (x.shape[1] - 1) // 2
-    behind, ego, ahead = order[:, :middle], order[:, middle : middle + 1], order[:, middle + 1 :]
+    behind = order[:, :middle]
+    ego = order[:, middle : middle + 1]
+    ahead = order[:, middle + 1 :]
     order = torch.cat((ego, behind, ahead), dim=1)
+
     x = x.gather(1, order)
     lane = lane.gather(1, order)
     return x - x[:, :1], lane
@@ -113,7 +159,14 @@ def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class RandomScenes:
-    """Table II: random positions and speeds."""
+    """Table II: random positions and speeds.
+
+    Attributes:
+        road: the same in all episodes, straight or a ring.
+        vehicles: M, the ego included.
+        parameters: ranges of the random numbers.
+        ego_visibility, others_visibility: when others see a lane change, a :class:`Visibility`.
+    """
 
     road: Road = STRAIGHT
     vehicles: int = 9
@@ -125,24 +178,30 @@ class RandomScenes:
         """See :func:`check_start`.
 
         The road must be the scene's, wide enough, and as a ring long enough.
+
+        Raises:
+            UserError: it is not, or the vehicles do not fit or could not brake in time.
         """
         p = self.parameters
         lane_width_m = road.lane_width_m
         ring_m = road.ring_m
         if isinstance(road.lanes, Tensor) or isinstance(lane_width_m, Tensor):
-            return  # a road for each row: its vehicles come from recordings
+            # A road for each row: its vehicles come from recordings.
+            return
         if road != self.road:
             raise UserError(
                 f"scenes: laid out on {_described(self.road)}, the traffic drives on "
                 f"{_described(road)}; give both the same road."
             )
         check_start(p, self.vehicles, road.lanes, idm)
+
         if lane_width_m <= p.widest_m:
             wide = "width_m" if p.width_m == p.widest_m else "truck_width_m"
             raise UserError(
                 f"env.lane_width_m={lane_width_m:g}: expected more than env.{wide}="
                 f"{p.widest_m:g}, or vehicles in neighbouring lanes touch; widen the lanes."
             )
+
         # Where a ring closes, the last vehicle is the first one's leader.
         if ring_m is not None and p.spread_m + p.spacing_m > ring_m:
             more = f" ({p.spacing_m:g} with lorries)" if p.spacing_m > p.min_spacing_m else ""
@@ -158,29 +217,45 @@ class RandomScenes:
         return self.parameters.longest_m
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
-        """One random scene per key; behind the ego, at index 0, the others follow by position."""
+        """One random scene per ``key`` [N] int64, fields [N, M].
+
+        The ego is at index 0; the others follow by position, from the rearmost on.
+        """
         p = self.parameters
+
+        # Uniform numbers in [0, 1), [N, M] each.
         drawn = [
             Purpose.SPAWN_POSITION,
             Purpose.SPAWN_SPEED,
             Purpose.SPAWN_DESIRED_SPEED,
             Purpose.SPAWN_TRUCK,
         ]
-        u, u_speed, u_desired, u_truck = uniform(key, 0, self.vehicles, drawn, dtype).unbind(-1)
+        numbers = uniform(key, 0, self.vehicles, drawn, dtype)
+        u_position, u_speed, u_desired, u_truck = numbers.unbind(-1)
+
+        # Places, and who is the ego.
         lane = draw_lanes(key, self.vehicles, int(self.road.lanes), p.lane_capacity())
-        x, lane = ego_first(place_in_lanes(lane, u, p.spread_m, p.spacing_m), lane)
+        x = place_in_lanes(lane, u_position, p.spread_m, p.spacing_m)
+        x, lane = ego_first(x, lane)
         is_ego = torch.arange(self.vehicles, device=key.device) == 0
+
         # In Table II who is ahead of the ego is slower than who is behind it.
         ahead = in_range(u_speed, p.front_speed_mps)
         behind = in_range(u_speed, p.rear_speed_mps)
         speed = torch.where(x > 0, ahead, behind)
-        speed = torch.where(is_ego, in_range(u_speed, p.ego_speed_mps), speed)
+        ego_speed = in_range(u_speed, p.ego_speed_mps)
+        speed = torch.where(is_ego, ego_speed, speed)
+
+        # The ego is no lorry, and its desired speed is not drawn.
         is_truck = (u_truck < p.truck_share) & ~is_ego
         others = in_range(u_desired, p.desired_speed_mps)
         desired = torch.where(is_ego, p.ego_desired_speed_mps, others)
-        desired = torch.where(is_truck, in_range(u_desired, p.truck_desired_speed_mps), desired)
+        trucks = in_range(u_desired, p.truck_desired_speed_mps)
+        desired = torch.where(is_truck, trucks, desired)
+
         visibility = torch.where(is_ego, int(self.ego_visibility), int(self.others_visibility))
         zero = torch.zeros_like(x)
+
         return Vehicles(
             x=x,
             y=lane.to(dtype) * float(self.road.lane_width_m),
@@ -197,6 +272,7 @@ class RandomScenes:
 
 
 def _described(road: Road) -> str:
+    """A road in words, for messages."""
     shape = "a straight road" if road.ring_m is None else f"a ring of {road.ring_m:g} m"
     return f"{shape} of {road.lanes} lanes of {road.lane_width_m} m"
 
@@ -220,22 +296,30 @@ def leave_room(
 ) -> Tensor:
     """Whether of two vehicles neither makes the other brake harder than is safe, elementwise.
 
+    Safe is :data:`SAFE_DECELERATION`; vehicles in different lanes do not make each other brake.
+
     Args:
+        one, other: their fields broadcast with ``distance``.
         lanes: that the drivers of the two attend to.
         distance: from the centre of the one to that of the other, m.
         ahead: whether the other is ahead, bool.
+        idm: by which they brake.
     """
+    # Sharing a lane, or nearly touching sides.
     its, theirs = lanes
     shares = (its.low <= theirs.high) & (theirs.low <= its.high)
-    # Sharing a lane, or nearly touching sides.
     sides = 0.5 * one.width + 0.5 * other.width + SIDE_M
     shares = shares | ((one.y - other.y).abs() < sides)
+
+    # What the one behind the other has to do, from bumper to bumper.
     bumpers = 0.5 * one.length + 0.5 * other.length
     gap = (distance.abs() - bumpers).clamp_max(FREE_GAP_M)
     behind = idm_acceleration(one.speed, one.desired_speed, gap, other.speed, idm)
     before = idm_acceleration(other.speed, other.desired_speed, gap, one.speed, idm)
     asked = torch.where(ahead, behind, before)
-    return ~(shares & other.valid) | (asked >= -SAFE_DECELERATION)
+
+    apart = ~(shares & other.valid)
+    return apart | (asked >= -SAFE_DECELERATION)
 
 
 def recycle(vehicles: Vehicles, road: Road, idm: IdmParameters) -> Vehicles:
@@ -245,26 +329,30 @@ def recycle(vehicles: Vehicles, road: Road, idm: IdmParameters) -> Vehicles:
     there whichever of the others move too.
     """
     away = out_of_range(vehicles, road)
+
     # By twice the range, so that the distance to the ego only changes its sign.
     distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
     across = vehicles.x - 2.0 * RANGE_M * torch.sign(distance)
     moved = vehicles.with_(x=torch.where(away, across, vehicles.x))
+
     # All at their new positions, then all at their current ones: [N, M] against [N, 2 M].
     both = Vehicles(*(torch.cat(pair, dim=1) for pair in zip(moved, vehicles)))
     count = vehicles.x.shape[1]
     pairs = compare(both, road, slice(0, count))
     low, high = with_target(body_lanes(both, road), both)
+    lanes = (
+        LaneRange(low[:, :count, None], high[:, :count, None]),
+        LaneRange(low[:, None], high[:, None]),
+    )
     room = leave_room(
         moved.part((..., None)),
         both.part((slice(None), None)),
-        (
-            LaneRange(low[:, :count, None], high[:, :count, None]),
-            LaneRange(low[:, None], high[:, None]),
-        ),
+        lanes,
         pairs.distance,
         pairs.order > 0,
         idm,
     )
+
     # Nobody is in its own way, at neither of its positions.
     itself = torch.eye(count, dtype=torch.bool, device=away.device).repeat(1, 2)
     goes = away & (room | itself).all(-1)

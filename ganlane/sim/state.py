@@ -92,7 +92,8 @@ class Vehicles(NamedTuple):
         """The same vehicles with finite numbers in invalid entries: NaN would spread in sums."""
 
         def finite(field: Tensor) -> Tensor:
-            return torch.where(self.valid, field, torch.nan_to_num(field, 1.0, 1.0, 1.0))
+            padding = torch.nan_to_num(field, 1.0, 1.0, 1.0)
+            return torch.where(self.valid, field, padding)
 
         return Vehicles(*(finite(field) if field.is_floating_point() else field for field in self))
 
@@ -105,9 +106,11 @@ class Vehicles(NamedTuple):
 class RowStretches(NamedTuple):
     """Where the lanes of each row begin and end, [N, L]; L is the largest number of lanes.
 
-    m; :data:`~ganlane.settings.road.FAR_M` behind or ahead where there is nothing. ``wall_m`` is
-    where a lane's wall stands; ``leave_by_m`` and ``changes`` are those of
-    :class:`~ganlane.settings.road.Leaving`.
+    Attributes:
+        begin_m, end_m: where a lane begins and ends, m;
+            :data:`~ganlane.settings.road.FAR_M` behind or ahead where it does not.
+        wall_m: where its wall stands, m; :data:`~ganlane.settings.road.FAR_M` without one.
+        leave_by_m, changes: those of :class:`~ganlane.settings.road.Leaving`.
     """
 
     begin_m: Tensor
@@ -121,12 +124,16 @@ class RowStretches(NamedTuple):
 class Road:
     """Lane 0 is the rightmost; the centre of lane k lies at ``y = k * lane_width_m``.
 
-    ``lanes`` and ``lane_width_m`` may be tensors [N, 1] if every environment has its own road
-    (recorded scenes). ``ring_m`` closes the road to a ring of that length: positions stay
-    unwrapped, only distances between vehicles are taken modulo the ring. ``stretches`` says where
-    each lane begins and ends (:mod:`ganlane.sim.lane_ends`); empty: all go on for ever.
-    ``row_stretches`` says so of roads that differ between rows, on which nobody has the mission to
-    reach an exit. ``flow`` says who enters and leaves (:mod:`ganlane.sim.flow`); None: nobody.
+    Attributes:
+        lanes, lane_width_m: number of lanes, and their width, m; tensors [N, 1] if every
+            environment has its own road (recorded scenes).
+        ring_m: closes the road to a ring of that length, m: positions stay unwrapped, only
+            distances between vehicles are taken modulo the ring. None: it is straight.
+        stretches: where each lane begins and ends (:mod:`ganlane.sim.lane_ends`); empty: all go on
+            for ever.
+        row_stretches: the same of roads that differ between rows, on which nobody has the mission
+            to reach an exit.
+        flow: who enters and leaves (:mod:`ganlane.sim.flow`); None: nobody.
 
     Raises:
         UserError: as many stretches as lanes are needed, one of them without an end and at most one
@@ -145,6 +152,7 @@ class Road:
             raise UserError("a flow of vehicles needs a road whose lanes end; give stretches.")
         if not self.stretches:
             return
+
         ends = [stretch.end for stretch in self.stretches]
         if (
             len(ends) != self.lanes
@@ -169,7 +177,7 @@ class Road:
         return exit_lane(self.stretches)
 
     def clamp_lane(self, lane: Tensor) -> Tensor:
-        """``lane`` limited to the road."""
+        """``lane``, whole numbers or floats, limited to the road."""
         if isinstance(self.lanes, Tensor):
             leftmost = (self.lanes - 1).to(lane.dtype)
             return torch.minimum(lane.clamp_min(0), leftmost)
@@ -180,8 +188,9 @@ class Road:
         return self.clamp_lane(torch.round(y / self.lane_width_m))
 
     def centre_of(self, lane: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-        """Lateral position of the centre of ``lane``, m."""
-        lane = lane if dtype is None else lane.to(dtype)
+        """Lateral position of the centre of ``lane``, m, in ``dtype``; None: as ``lane``."""
+        if dtype is not None:
+            lane = lane.to(dtype)
         return lane * self.lane_width_m
 
     def left_edge_m(self) -> float | Tensor:
@@ -197,6 +206,7 @@ class Road:
         distance = end - start
         if self.ring_m is None:
             return distance
+
         # Into [-half, half): the shorter way round.
         half = 0.5 * self.ring_m
         return torch.remainder(distance + half, self.ring_m) - half
@@ -211,15 +221,20 @@ def road_in(state: Any, default: Road) -> Road:
     rows = state.get("road", None)
     if rows is None:
         return default
+
     stretches = None
     if RowStretches._fields[0] in rows.keys():  # noqa: SIM118 (a TensorDict is no Mapping)
         stretches = RowStretches(*(rows.get(name) for name in RowStretches._fields))
+
     return Road(rows.get("lanes"), rows.get("lane_width_m"), row_stretches=stretches)
 
 
 def road_fields(road: Road) -> dict[str, Tensor]:
     """What :func:`road_in` reads of a road that differs between rows: [N, 1], stretches [N, L]."""
-    fields = {"lanes": road.lanes, "lane_width_m": road.lane_width_m}
+    fields = {
+        "lanes": road.lanes,
+        "lane_width_m": road.lane_width_m,
+    }
     if road.row_stretches is not None:
         fields |= road.row_stretches._asdict()
     return fields  # type: ignore[return-value]
@@ -251,8 +266,10 @@ def spanned(lanes: LaneRange) -> Tensor:
     # 64 rows and 20 % longer with 1024.
     if reads_are_cheap(lanes.low):
         most = int((lanes.high - lanes.low).amax())
+        # One lane: the lowest is the highest. Two: the lowest and the highest.
         if most < 2:
             return torch.stack(lanes[: most + 1], dim=-1)
+
     middle = torch.minimum(lanes.low + 1, lanes.high)
     return torch.stack((lanes.low, middle, lanes.high), dim=-1)
 
@@ -270,6 +287,7 @@ def body_lanes(vehicles: Vehicles, road: Road) -> LaneRange:
     """Lanes that each body enters by more than :data:`ENTRY_M`."""
     # A corner that just touches the next lane does not count.
     reach = lateral_half_extent(vehicles) - ENTRY_M
+    # Right and left edge in one tensor, [2, N, M].
     edges = torch.stack((vehicles.y - reach, vehicles.y + reach))
     return LaneRange(*road.lane_of(edges).unbind())
 
@@ -277,31 +295,39 @@ def body_lanes(vehicles: Vehicles, road: Road) -> LaneRange:
 def with_target(lanes: LaneRange, vehicles: Vehicles) -> LaneRange:
     """``lanes`` extended to the target lane: the lanes that the driver attends to."""
     target = vehicles.target_lane.to(lanes.low.dtype)
-    return LaneRange(torch.minimum(lanes.low, target), torch.maximum(lanes.high, target))
+    low = torch.minimum(lanes.low, target)
+    high = torch.maximum(lanes.high, target)
+    return LaneRange(low, high)
 
 
 def presence(vehicles: Vehicles, road: Road, body: LaneRange, attention: LaneRange) -> LaneRange:
     """Lanes in which others see each vehicle, by its visibility.
 
     An empty range for invalid vehicles.
+
+    Args:
+        body: lanes of the bodies (:func:`body_lanes`).
+        attention: those and the target lanes (:func:`with_target`).
     """
     # From the least to the most that others see: centre, body, body and target lane.
     centre = road.lane_of(vehicles.y)
     signalled = vehicles.visibility == int(Visibility.SIGNALLED)
     by_body = vehicles.visibility == int(Visibility.BODY)
-    low = torch.where(signalled, attention.low, torch.where(by_body, body.low, centre))
-    high = torch.where(signalled, attention.high, torch.where(by_body, body.high, centre))
-    return LaneRange(
-        # Lowest above highest: in no lane at all.
-        torch.where(vehicles.valid, low, torch.inf),
-        torch.where(vehicles.valid, high, -torch.inf),
-    )
+    low = torch.where(by_body, body.low, centre)
+    low = torch.where(signalled, attention.low, low)
+    high = torch.where(by_body, body.high, centre)
+    high = torch.where(signalled, attention.high, high)
+
+    # Lowest above highest: in no lane at all.
+    low = torch.where(vehicles.valid, low, torch.inf)
+    high = torch.where(vehicles.valid, high, -torch.inf)
+    return LaneRange(low, high)
 
 
 def lane_change_done(vehicles: Vehicles, road: Road) -> Tensor:
-    """Whether the lane change is done.
+    """Whether the lane change is done: centre within :data:`ARRIVED_M` of the target lane's centre.
 
-    Centre within :data:`ARRIVED_M` of the target lane's centre, bool.
+    Bool, of the shape of the vehicles' fields.
     """
     centre = road.centre_of(vehicles.target_lane, vehicles.y.dtype)
     return (vehicles.y - centre).abs() < ARRIVED_M

@@ -84,58 +84,78 @@ class ActionMaskTransform(PerceptionTransform):
             raise UserError(
                 f"mask.form={form!r}: expected one of {', '.join(FORMS)}; choose one of them."
             )
+
         self.mask = MaskParameters(form, safe_deceleration)
         self.actions = actions or ActionParameters()
         self.actions.check_mask(form)
         # Behind legal there is nothing to report: keeping the lane is always legal.
         further = [] if form == "legal" else [keys.NO_SAFE_ACTION]
-        super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=[keys.ACTION_MASK, *further])
+        super().__init__(
+            in_keys=[keys.VEHICLES, keys.EGO],
+            out_keys=[keys.ACTION_MASK, *further],
+        )
         self.road = road
         self.idm = idm
         self.abort = abort
+
         # The kernel has no function for ``legal``, which is a comparison or two.
         self.native: SafeActions | None = None
         if native_vehicles is not None and form != "legal":
             self.native = SafeActions(road, native_vehicles, idm, self.mask, abort)
 
     def allowed(self, vehicles: Vehicles, direction: Tensor, road: Road) -> tuple[Tensor, Tensor]:
-        """The mask [N, 3], and whether no action is safe [N].
+        """The mask [N, 3] of keep, left and right, and whether no action is safe [N]; bool.
 
-        ``vehicles`` are as the ego perceives them; ``direction`` [N] is that of its current lane
-        change.
+        Args:
+            vehicles: [N, M], as the ego perceives them.
+            direction: of its current lane change, [N]: -1 right, 0 none, 1 left.
+            road: the environment's, or of each row.
         """
         side = constant(SIDES, direction)
+
         # Keeping the lane is no command that the ego could fail to hear.
         obeyed = (side == 0) | is_heard(side, direction[:, None], self.abort)
         legal = stays_on_road(vehicles, side, road) & obeyed
-        form, safe_deceleration = self.mask.form, self.mask.safe_deceleration
+
+        form = self.mask.form
         if form == "legal":
             return legal, torch.zeros_like(legal[:, 0])
+
         # How hard the ego, in its lane and in those beside it, and who would follow it there would
         # have to brake by IDM. A lane that does not exist has no vehicles, and is not legal.
         scene = ego_scene(vehicles, road)
         lanes = scene.observers.target_lane[..., None] + side.to(vehicles.x.dtype)
         accelerations = lane_accelerations(scene, lanes, self.idm)
         ego = accelerations.observer[:, 0]
-        safe = torch.minimum(ego, accelerations.with_it[:, 0]) >= -safe_deceleration
+        follower = accelerations.with_it[:, 0]
+        safe_deceleration = self.mask.safe_deceleration
+        safe = torch.minimum(ego, follower) >= -safe_deceleration
+
+        # Of the two changes, [N, 2].
         changes = legal[:, 1:] & safe[:, 1:]
         if form == "foresight":
+            # On the way the ego heeds its own lane and the new one.
             slowest = torch.minimum(ego[:, :1], ego[:, 1:])
-            changes = changes & has_room(scene, lanes[:, 0, 1:], slowest, safe_deceleration)
+            room = has_room(scene, lanes[:, 0, 1:], slowest, safe_deceleration)
+            changes = changes & room
+
         # Keeping the lane is always allowed: where nothing is safe, there is nothing better.
         none = ~(safe[:, :1] | changes).any(1)
         keep = torch.ones_like(safe[:, :1])
         return torch.cat((keep, changes), dim=1), none
 
     def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
-        """Write ``action_mask``, and with ``safe`` ``no_safe_action``."""
+        """Write ``action_mask``, and with ``safe`` and ``foresight`` ``no_safe_action``."""
         direction = state.get(keys.EGO).get("change_direction")
         if self.native is not None:
             mask, none = self.native.allowed(seen, direction)
         else:
             mask, none = self.allowed(seen, direction, road_in(state, self.road))
+
         if self.actions.form == LANE_SPEED:
             mask = torch.cat((mask, allowed_speeds(state, self.actions)), dim=1)
+
+        # With ``legal`` there is one out key alone.
         for name, flags in zip(self.out_keys, (mask, none[:, None])):
             state.set(name, flags)
         return state

@@ -38,25 +38,39 @@ _MASKED = 1e9
 
 
 class Others(NamedTuple):
-    """The other vehicles relative to the ego, each [N, M - 1]; numbers of Table III in [-1, 1]."""
+    """The other vehicles relative to the ego, each [N, M - 1].
 
-    # Table III: relative position, speed and lane (left is positive), and whether it exists.
+    The first three are Table III's numbers, scaled and clipped to [-1, 1].
+
+    Attributes:
+        position: distance along the road, ahead of the ego positive.
+        speed: relative speed, positive if faster than the ego.
+        lane: lanes apart, to the left positive.
+        valid: whether the vehicle exists, bool.
+        drift: position within its lane: 0 in the centre, 1 on the left line, -1 on the right one.
+        bumpers_m: half of the ego's length plus half of its own, m.
+    """
+
     position: Tensor
     speed: Tensor
     lane: Tensor
     valid: Tensor
-    #: Position within its lane: 0 in the centre, 1 on the left line, -1 on the right one.
     drift: Tensor
-    #: Half of the ego's length plus half of its own, m.
     bumpers_m: Tensor
 
 
 class View(NamedTuple):
     """What the parts of an observation are computed from.
 
-    ``vehicles`` is the true state; ``seen`` the others as the ego perceives them, with the ego
-    (column 0) where it was at that moment. ``progress`` and ``direction`` [N] belong to the ego's
-    own lane change.
+    Attributes:
+        vehicles: the true state, [N, M].
+        seen: the others as the ego perceives them, [N, M], with the ego (column 0) where it was at
+            that moment.
+        others: ``seen`` relative to the ego.
+        road: the environment's, or of each row.
+        scale: normalisers.
+        progress: of the ego's own lane change, 0 to 1, [N].
+        direction: of that change, -1 right, 0 none, 1 left, [N].
     """
 
     vehicles: Vehicles
@@ -69,9 +83,13 @@ class View(NamedTuple):
 
 
 def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> Others:
-    """The others, ordered by the vehicles' indices; an invalid one is (1, 0, 0), far ahead."""
+    """The others, ordered by the vehicles' indices; an invalid one is (1, 0, 0), far ahead.
+
+    ``vehicles`` [N, M] are as the ego perceives them.
+    """
     ego = vehicles.columns(slice(0, 1))
     others = vehicles.columns(slice(1, None))
+
     # Relative numbers over their scale, clipped.
     distance = road.distance_ahead(ego.x, others.x)
     position = (distance / scale.range_m).clamp(-1.0, 1.0)
@@ -79,16 +97,21 @@ def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> O
     own_lane = road.lane_of(others.y)
     lanes_apart = own_lane - road.lane_of(ego.y)
     lane = (lanes_apart / _widest(road.lanes)).clamp(-1.0, 1.0)
+
     # Offset to the left of the lane's centre over half of the lane's width.
     offset = others.y - road.centre_of(own_lane, others.y.dtype)
     drift = (2.0 * offset / road.lane_width_m).clamp(-1.0, 1.0)
     bumpers_m = 0.5 * ego.length + 0.5 * others.length
+
     valid = others.valid
-    position = torch.where(valid, position, 1.0)
-    speed, lane, drift, bumpers_m = (
-        torch.where(valid, number, 0.0) for number in (speed, lane, drift, bumpers_m)
+    return Others(
+        position=torch.where(valid, position, 1.0),
+        speed=torch.where(valid, speed, 0.0),
+        lane=torch.where(valid, lane, 0.0),
+        valid=valid,
+        drift=torch.where(valid, drift, 0.0),
+        bumpers_m=torch.where(valid, bumpers_m, 0.0),
     )
-    return Others(position, speed, lane, valid, drift, bumpers_m)
 
 
 def _widest(lanes: int | Tensor) -> int | Tensor:
@@ -101,15 +124,20 @@ def _widest(lanes: int | Tensor) -> int | Tensor:
 def own_state(view: View, here: bool = False) -> Tensor:
     """s1 to s3, [N, 3].
 
-    Speed over desired speed (not clipped), a lane to the left, a lane to the right; ``here``: one
-    that the ego may change into where it is.
+    Speed over desired speed (not clipped), then whether there is a lane to the left and to the
+    right, 0 or 1.
+
+    Args:
+        here: a lane counts only where the ego may change into it; else anywhere on the road.
     """
     ego = view.vehicles.columns(slice(0, 1))
     road = view.road
     lane = road.lane_of(ego.y)
     sides = constant((1.0, -1.0), lane)
-    # Whether there is a lane to change to.
+
+    # Whether there is a lane to change to, [N, 2].
     there = may_change(road, lane, sides, ego.x) if here else on_road(road, lane + sides)
+
     return torch.cat((ego.speed / ego.desired_speed, there.to(ego.y.dtype)), dim=1)
 
 
@@ -123,6 +151,8 @@ def vehicle_list(view: View) -> Tensor:
     distance = view.road.distance_ahead(x[:, :1], x[:, 1:]).abs()
     distance = torch.where(view.others.valid, distance, torch.inf)
     order = distance.argsort(dim=1, stable=True)
+
+    # Position, speed and lane of one vehicle after the other.
     columns = [field.gather(1, order) for field in view.others[:3]]
     return torch.stack(columns, dim=-1).flatten(1)
 
@@ -134,36 +164,48 @@ def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
     there is none. The nearest vehicle is the one with the nearest centre; one exactly level with
     the ego counts as behind. The gap, over the range of sight, is from bumper to bumper.
 
-    ``drift`` adds a fourth number, :attr:`Others.drift`, [N, 24], which shows a lane change before
-    its middle. With ``overlap``, where two bodies overlap along the road the gap is below 0, and
-    the nearness above 1 by 1 per metre; otherwise the gap is 0 there.
+    Args:
+        drift: adds a fourth number, :attr:`Others.drift`, [N, 24], which shows a lane change before
+            its middle.
+        overlap: where two bodies overlap along the road the gap is below 0, and the nearness above
+            1 by 1 per metre; without it the gap is 0 there.
     """
     others = view.others
-    # All six directions at once: each is a minimum over the vehicles there.
     range_m = view.scale.range_m
+
+    # All six directions at once: each is a minimum over the vehicles there.
     side = constant(_SIDES, others.position)[:, None]
     ahead = constant(_AHEAD, others.position)[:, None]
+
     # Distances [N, 6, M - 1] in the six directions, out of reach for who is not there.
     distance = others.position[:, None, :] * ahead
+
+    # At the range of sight the position is clipped to 1.
     in_sight = (others.valid & (others.position.abs() < 1.0))[:, None, :]
     on_that_end = (distance > 0) | ((distance == 0) & (ahead < 0))
+    # Back to whole lanes from what was scaled in other_vehicles().
     lanes_apart = torch.round(others.lane * _widest(view.road.lanes))[:, None, :]
     absent = ~(in_sight & on_that_end & (lanes_apart == side))
     distance = torch.add(distance, absent, alpha=_MASKED)
+
+    # [N, 6, 1]
     nearest = distance.amin(-1, keepdim=True)
     # Several vehicles can be equally near: the minimum over all of them is taken below.
     farther = distance > nearest
     exists = nearest <= 1.0
 
     def of_the_nearest(field: Tensor) -> Tensor:
+        """A ``field`` [N, M - 1] of the nearest vehicle, [N, 6, 1]; the lowest if equally near."""
         value = torch.add(field[:, None, :], farther, alpha=_MASKED)
         return torch.where(exists, value.amin(-1, keepdim=True), 0.0)
 
     # Of two equally near vehicles the longer one counts.
     gap_m = nearest * range_m + of_the_nearest(-others.bumpers_m)
-    gap_m = gap_m if overlap else gap_m.clamp_min(0.0)
+    if not overlap:
+        gap_m = gap_m.clamp_min(0.0)
     overlap_m = (-gap_m).clamp_min(0.0)
     nearness = torch.exp(-gap_m.clamp_min(0.0) / NEARNESS_M) + overlap_m / OVERLAP_M
+
     numbers = [
         torch.where(exists, gap_m / range_m, 1.0),
         torch.where(exists, nearness, 0.0),
@@ -182,40 +224,54 @@ def lane_change(view: View) -> Tensor:
 def road_ahead(view: View) -> Tensor:
     """Where lanes begin and end, [N, 8]; distances over :data:`ROAD_SIGHT_M`, from 0 to 1.
 
-    Of the left, own and right lane how far it goes on, and how far away it begins: (0, 1) for a
-    lane that the road has not. Then the lanes between the ego and the exit lane over
+    Of the left, own and right lane how far it goes on, [N, 3], and how far away it begins, [N, 3]:
+    0 and 1 for a lane that the road has not. Then the lanes between the ego and the exit lane over
     ``max(n - 1, 1)``, positive to the left, and the distance of its end: (0, 1) without an exit.
     """
     ego = view.vehicles.columns(slice(0, 1))
     road = view.road
     front = ego.x + 0.5 * ego.length
     lane = road.lane_of(ego.y)
+
+    # Left, own and right lane, [N, 3].
     lanes = lane + constant((1.0, 0.0, -1.0), lane)
     there = on_road(road, lanes)
+
+    # A road whose lanes all go on, without an exit.
     far = torch.ones_like(lanes)
-    goes_on, begins_in = far, far - 1.0
-    ahead, distance = lane - lane, far[:, :1]
+    goes_on = far
+    begins_in = far - 1.0
+    ahead = lane - lane
+    distance = far[:, :1]
+
     if road.has_lane_ends:
         goes_on = _in_sight(of_lane(ends(road), lanes, front) - front)
         begins_in = _in_sight(of_lane(begins(road), lanes, front) - front)
     if road.exit_lane is not None:
         ahead = (road.exit_lane - lane) / _widest(road.lanes)
         distance = _in_sight(ends(road)[road.exit_lane] - front)
+
     goes_on = torch.where(there, goes_on, 0.0)
     begins_in = torch.where(there, begins_in, 1.0)
     return torch.cat((goes_on, begins_in, ahead, distance), dim=1)
 
 
 def _in_sight(distance_m: Tensor) -> Tensor:
+    """A distance over the range of sight, from 0 to 1."""
     return (distance_m / ROAD_SIGHT_M).clamp(0.0, 1.0)
 
 
 class Part(NamedTuple):
-    """A part of an observation: its numbers [N, size], and its size, all in all or per vehicle."""
+    """A part of an observation.
+
+    Attributes:
+        numbers: computes it, [N, size], or [N, size (M - 1)].
+        size: how many numbers it has, in all or of every other vehicle.
+        each_vehicle: whether ``size`` is that of every other vehicle.
+    """
 
     numbers: Callable[[View], Tensor]
     size: int
-    #: Whether ``size`` is that of each of the others.
     each_vehicle: bool = False
 
 
@@ -241,25 +297,39 @@ OBSERVATIONS: Final[dict[str, tuple[Part, ...]]] = {
 
 
 def control_numbers(vehicles: Vehicles, set_speed: Tensor | None, road: Road) -> Tensor:
-    """What the driver needs to command more than the lane, [N, 1] or [N, 2].
+    """What the driver needs to command more than the lane.
 
-    With a ``set_speed`` [N], m/s, that over the desired speed; without one, for ``continuous``, the
-    ego's offset in its lane (1 on the left line, -1 on the right one) and its heading over
-    ``HEADING_RAD``, to the left positive, clipped.
+    Args:
+        set_speed: of ``lane_speed``, [N], m/s; None: the actions are ``continuous``.
+
+    Returns:
+        For ``lane_speed`` the set speed over the desired speed, [N, 1]. For ``continuous`` the
+        ego's offset in its lane (1 on the left line, -1 on the right one) and its heading over
+        ``HEADING_RAD``, to the left positive, clipped to [-1, 1], [N, 2].
     """
     ego = vehicles.columns(slice(0, 1))
     if set_speed is not None:
         return set_speed[:, None] / ego.desired_speed
+
     centre = road.centre_of(road.lane_of(ego.y), ego.y.dtype)
     offset = 2.0 * (ego.y - centre) / road.lane_width_m
     return torch.cat((offset, ego.heading / HEADING_RAD), dim=1).clamp(-1.0, 1.0)
 
 
 def observation_size(name: str, vehicles: int, actions: ActionParameters | None = None) -> int:
-    """Length D of observation ``name`` for ``vehicles`` vehicles, the ego included."""
-    size = 0 if actions is None else CONTROL_NUMBERS[actions.form]
+    """Length D of observation ``name``.
+
+    Args:
+        name: a key of :data:`OBSERVATIONS`.
+        vehicles: M, the ego included.
+        actions: those of the environment; None: numbered lane changes.
+    """
+    size = 0
+    if actions is not None:
+        size = CONTROL_NUMBERS[actions.form]
     for part in OBSERVATIONS[name]:
-        size += part.size * (vehicles - 1 if part.each_vehicle else 1)
+        times = vehicles - 1 if part.each_vehicle else 1
+        size += part.size * times
     return size
 
 
@@ -297,11 +367,14 @@ class ObservationTransform(PerceptionTransform):
                 f"vehicles={vehicles}: an observation is of at least one other vehicle; "
                 "give 2 or more."
             )
+
         self.road = road
         self.vehicles = vehicles
         self.form = form
         self.actions = actions or ActionParameters()
         self.scale = scale or ObservationScale()
+
+        #: The kernel's function; None: the tensor code computes the observation.
         self.native: LaneView | None = None
         if native and form in NATIVE_FORMS:
             self.native = LaneView(road, vehicles, self.scale, form)
@@ -317,19 +390,24 @@ class ObservationTransform(PerceptionTransform):
         """The observation [N, D]; arguments as the fields of :class:`View`."""
         others = other_vehicles(seen, road, self.scale)
         view = View(vehicles, seen, others, road, self.scale, progress, direction)
-        return torch.cat([part.numbers(view) for part in OBSERVATIONS[self.form]], dim=1)
+        parts = [part.numbers(view) for part in OBSERVATIONS[self.form]]
+        return torch.cat(parts, dim=1)
 
     def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
         """Write ``observation``."""
         # Own state from the truth, the others as perceived.
         ego = state.get(keys.EGO)
-        progress, direction = ego.get("change_progress"), ego.get("change_direction")
+        progress = ego.get("change_progress")
+        direction = ego.get("change_direction")
         road = road_in(state, self.road)
+
         # The kernel computes the same numbers up to the rounding of the exponential function.
         if self.native is not None and not wants_gradient([*vehicles, *seen, progress]):
             observation = self.native.observe(vehicles, progress, direction, seen)
         else:
             observation = self.observe(vehicles, progress, direction, road, seen)
+
+        # Some actions need further numbers.
         if CONTROL_NUMBERS[self.actions.form]:
             set_speed = ego.get(keys.SET_SPEED) if self.actions.form == LANE_SPEED else None
             further = control_numbers(vehicles, set_speed, road)

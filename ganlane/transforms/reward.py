@@ -23,11 +23,18 @@ def speed_reward(
     """``(v - 15) / (v_des - 15)``, or its negation where the ego braked hard.
 
     Hard is what is below ``low_acceleration`` on average over the decision.
+
+    Args:
+        speed, desired_speed: of the ego, m/s.
+        mean_acceleration: over the decision, m/s2.
+        p: the base speed (the 15 m/s of the formula), and what counts as braking hard.
     """
     reward = (speed - p.base_speed_mps) / (desired_speed - p.base_speed_mps)
+
     # The paper negates the reward, which below the base speed would pay for hard braking.
     punished = -reward if p.literal_low_acceleration else -reward.abs()
-    return torch.where(mean_acceleration < p.low_acceleration, punished, reward)
+    braked_hard = mean_acceleration < p.low_acceleration
+    return torch.where(braked_hard, punished, reward)
 
 
 class RewardTransform(StateTransform):
@@ -54,14 +61,18 @@ class RewardTransform(StateTransform):
         vehicles = tensordict.get(keys.VEHICLES)
         ego = tensordict.get(keys.EGO)
         events = tensordict.get(keys.EVENTS)
+
+        # Columns [N, 1].
         speed = vehicles.get("speed")[:, EGO_INDEX, None]
         desired = vehicles.get("desired_speed")[:, EGO_INDEX, None]
         acceleration = ego.get("mean_acceleration")[:, None]
         started = ego.get("started_change")[:, None]
+
+        terms = {"speed": self.period * speed_reward(speed, desired, acceleration, p)}
         # Every other term is a price times how often its event happened in the decision. They are
         # added up in the order of term_names, which floating-point sums depend on.
-        terms = {"speed": self.period * speed_reward(speed, desired, acceleration, p)}
         for name in p.term_names[1:]:
+            # A lane change is no event: the ego remembers whether it has started one.
             count = started if name == "lane_change" else events.get(name)
             terms[name] = getattr(p, name) * count.to(speed.dtype)
         return terms
@@ -76,10 +87,12 @@ class RewardTransform(StateTransform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         # A reset has driven nothing, yet its keys must be those of a step.
-        zero = torch.zeros_like(tensordict_reset.get(keys.VEHICLES).get("x")[:, :1])
+        vehicles = tensordict_reset.get(keys.VEHICLES)
+        zero = torch.zeros_like(vehicles.get("x")[:, :1])
         return _write_terms(tensordict_reset, dict.fromkeys(self.parameters.term_names, zero))
 
 
 def _write_terms(state: TensorDictBase, terms: dict[str, Tensor]) -> TensorDictBase:
+    """``state`` with ``terms`` [N, 1] nested in it."""
     nested = TensorDict._new_unsafe(terms, batch_size=state.batch_size)
     return state.set(keys.REWARD_TERMS, nested)

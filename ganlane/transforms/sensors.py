@@ -41,24 +41,42 @@ def measure(
 ) -> TensorDictBase:
     """``x, y, speed, valid`` [N, M] as measured at the physics steps ``step`` [N]; no delay.
 
-    ``vehicles`` [N, M] are the true ones, ``key`` [N] is that of the episodes
-    (:func:`ganlane.sim.random.episode_key`).
+    Args:
+        vehicles: the true ones, [N, M].
+        key: of the episodes, [N] int64 (:func:`ganlane.sim.random.episode_key`).
+        step: physics steps since their start, [N] int64.
+        parameters: sizes of the errors.
     """
-    values = {"x": vehicles.x, "y": vehicles.y, "speed": vehicles.speed}
+    values = {
+        "x": vehicles.x,
+        "y": vehicles.y,
+        "speed": vehicles.speed,
+    }
     valid = vehicles.valid
     count = valid.shape[1]
     dtype = vehicles.x.dtype
+
     # Column 0 stays exact: the ego knows itself.
     other = torch.arange(count, device=valid.device) != keys.EGO_INDEX
-    scales = (parameters.position_noise_m, parameters.lateral_noise_m, parameters.speed_noise_mps)
+
+    # Standard deviations of x, y (m) and speed (m/s).
+    scales = (
+        parameters.position_noise_m,
+        parameters.lateral_noise_m,
+        parameters.speed_noise_mps,
+    )
     if any(scales):
         noise = normal(key, step, count, _SENSED, dtype).unbind(-1)
         for (name, value), scale, error in zip(values.items(), scales, noise):
-            values[name] = torch.where(other, value + scale * error, value)
+            noisy = value + scale * error
+            values[name] = torch.where(other, noisy, value)
+
     # A vehicle that drops out is as one that is not there.
     if parameters.dropout > 0:
         drawn = uniform(key, step, count, [Purpose.SENSED_DROPOUT], dtype)[..., 0]
-        valid = valid & ~((drawn < parameters.dropout) & other)
+        drops_out = (drawn < parameters.dropout) & other
+        valid = valid & ~drops_out
+
     values["valid"] = valid
     return TensorDict._new_unsafe(values, batch_size=valid.shape[:1], device=valid.device)
 
@@ -75,7 +93,8 @@ class PerceptionTransform(StateTransform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the out keys into any TensorDict that holds the raw state."""
-        vehicles = seen = Vehicles.of(tensordict.get(keys.VEHICLES))
+        vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
+        seen = vehicles
         # Without sensors the ego sees what there is.
         perceived = tensordict.get(PERCEIVED, None)
         if perceived is not None:
@@ -131,16 +150,22 @@ class SensorTransform(StateTransform):
         newest = self._measured(next_tensordict)
         if self.delay == 0:
             return next_tensordict.set(PERCEIVED, newest)
+
         waiting = tensordict.get(SENSORS, None)
         if waiting is None or waiting.get("x").shape[1] != self.delay:
             raise UserError(
                 f"the state holds no {self.delay} measurements under {SENSORS!r}: it comes from an "
                 "environment with other sensors; start from a reset of this one."
             )
-        # The oldest measurement is delivered, and the newest joins the end of the queue.
-        next_tensordict.set(PERCEIVED, waiting.apply(lambda queue: queue[:, 0].clone()))
+
+        # The oldest measurement is delivered ...
+        oldest = waiting.apply(lambda queue: queue[:, 0].clone())
+        next_tensordict.set(PERCEIVED, oldest)
+
+        # ... and the newest joins the end of the queue, in every field [N, K, M].
         queues = waiting.apply(
-            lambda queue, new: torch.cat((queue[:, 1:], new[:, None]), dim=1), newest
+            lambda queue, new: torch.cat((queue[:, 1:], new[:, None]), dim=1),
+            newest,
         )
         return next_tensordict.set(SENSORS, queues)
 

@@ -91,7 +91,7 @@ def run_episodes(
         evaluation = _Evaluation(env, policy, numbers, seed, make_smaller)
         driven = evaluation.run(on_progress)
 
-    return _episode_rows(driven, numbers, seed, getattr(env, "road", STRAIGHT))
+    return _episode_rows(driven, numbers, seed, evaluation.road)
 
 
 def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:

@@ -34,9 +34,8 @@ class Run:
     results: dict[str, Any]
 
     def __repr__(self) -> str:
-        kind = type(self).__name__
         names = ", ".join(self.results)
-        return f"{kind}(folder={str(self.folder)!r}, results: {names})"
+        return f"{type(self).__name__}(folder={str(self.folder)!r}, results: {names})"
 
     def _repr_html_(self) -> str:
         """For notebooks.
@@ -46,11 +45,10 @@ class Run:
         # A table needs rows; other commands leave single numbers.
         rows = self.results.get("rows")
         if not isinstance(rows, list):
-            row = {}
-            for key, value in self.results.items():
-                if isinstance(value, int | float | str):
-                    row[key] = value
-            rows = [row]
+            single = int | float | str
+            rows = [
+                {key: value for key, value in self.results.items() if isinstance(value, single)}
+            ]
 
         table = pl.DataFrame(rows, infer_schema_length=None)._repr_html_()
         return f"<p>{escape(str(self.folder))}</p>{table}"
@@ -189,9 +187,8 @@ def sweep_rows(folder: Path) -> list[dict[str, Any]]:
 
     rows = []
     for name, run in zip(names_of_runs(runs), runs):
-        text = (run / "results.json").read_text(encoding="utf-8")
-        for row in json.loads(text).get("rows") or []:
-            rows.append({"run": name, **row})
+        record = json.loads((run / "results.json").read_text(encoding="utf-8"))
+        rows += [{"run": name, **row} for row in record.get("rows") or []]
 
     # Rows of other commands have other columns, so they make no common table.
     return rows if all("mean_reward" in row for row in rows) else []
@@ -293,10 +290,9 @@ def machine_sentence(threads: Sequence[int]) -> str:
         hardware += f", {here['accelerator']}"
 
     # The versions decide about digits.
-    used_threads = ", ".join(map(str, threads))
-    used = f"Python {here['python']}, torch {here['torch']} (threads: {used_threads})"
+    used = f"Python {here['python']}, torch {here['torch']}"
     version = f"ganlane {code['version']}"
     if code["revision"]:
         modified = ", modified" if code["modified"] else ""
         version += f" ({code['revision'][:12]}{modified})"
-    return f"{hardware}; {used}; {version}."
+    return f"{hardware}; {used} (threads: {', '.join(map(str, threads))}); {version}."

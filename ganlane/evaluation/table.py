@@ -186,7 +186,7 @@ class Table:
 
 
 #: Columns of an evaluation, names before numbers; ``run``: of a sweep.
-_COLUMNS: Mapping[str, Cell] = {
+_COLUMNS = {
     "run": text_of("run"),
     "agent": text_of("agent"),
     "traffic": text_of("traffic"),
@@ -250,7 +250,7 @@ def paired_table(rows: Sequence[Row]) -> str:
 
     A note says why there is no verdict where episodes are few.
     """
-    columns: Mapping[str, Cell] = {
+    columns = {
         "paired lead": lambda row: f"{row['agent']} over {row['over']}",
         "traffic": text_of("traffic"),
         "reward [95 %]": lambda row: with_sign(row, "lead", 1),

@@ -165,7 +165,7 @@ def long_run(
     traffic = make(road)
     events = EventCounter(road)
 
-    batches: list[dict[str, np.ndarray]] = []
+    batches = []
     km = 0.0
     episodes = 0
     moving = True
@@ -376,11 +376,10 @@ def mean_speeds(speed: np.ndarray, **others: np.ndarray) -> dict[str, float | in
         **others,
     }
 
-    means: dict[str, float | int | None] = {}
+    means = {}
     for name, values in of_episodes.items():
         means[name] = float(values.mean()) if len(values) else None
-    means["episodes"] = len(speed)
-    return means
+    return {**means, "episodes": len(speed)}
 
 
 def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:

@@ -161,8 +161,7 @@ def _run_cells(run: Mapping[str, Any], traffic: str) -> dict[str, str]:
 
     # The tails show most: recorded drivers brake and accelerate harder than models.
     for level, value in run["acceleration_quantiles"].items():
-        percent = 100 * float(level)
-        cells[f"acceleration, {percent:g} % quantile"] = number(value, 2)
+        cells[f"acceleration, {100 * float(level):g} % quantile"] = number(value, 2)
     return cells
 
 

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 from tqdm import tqdm
@@ -201,17 +200,13 @@ def drive_suite(
 
     tables = []
     seconds: dict[str, float] = {}
-    no_terminal = not sys.stderr.isatty()
-    for driver, alone in tqdm(cells, unit="cell", disable=no_terminal):
+    for driver, alone in tqdm(cells, unit="cell", disable=not sys.stderr.isatty()):
         file = _file_of(driver, alone, Path(config.cells))
         # What was driven before is not driven again.
         if file is not None and file.is_file():
             table, took_s = _read(file)
         else:
             table, took_s = _drive(driver, alone, file)
-            if no_terminal:
-                title = f"{driver.name} on {', '.join(alone.traffics)}"
-                print(f"{title}: {table.height} episodes", file=sys.stderr)
 
         tables.append(table)
         seconds[driver.name] = seconds.get(driver.name, 0.0) + took_s
@@ -237,7 +232,7 @@ def _file_of(driver: Driver, config: EvaluateConfig, folder: Path) -> Path | Non
 
     # With the observation and the mask that the driver brings.
     driven, _ = driver.driving(config)
-    settings: dict[str, Any] = asdict(driven)
+    settings = asdict(driven)
     # They change how fast the cell is driven, not what happens.
     for name in ("threads", "columns", "num_envs", "agents"):
         del settings[name]
@@ -258,7 +253,8 @@ def _file_of(driver: Driver, config: EvaluateConfig, folder: Path) -> Path | Non
 def _drive(driver: Driver, config: EvaluateConfig, file: Path | None) -> tuple[pl.DataFrame, float]:
     """Drive one cell and store it; its episodes, and the seconds that it took."""
     begun = time.monotonic()
-    table = compare([driver], config, quiet=True, once=True)
+    # On a terminal the bar of all cells tells how far it is, else a line for each of them.
+    table = compare([driver], config, quiet=sys.stderr.isatty(), once=True)
     took_s = time.monotonic() - begun
 
     if file is not None:

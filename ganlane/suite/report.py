@@ -45,8 +45,7 @@ def _trainings(row: Row) -> str:
 
 def _kinds(row: Row) -> str:
     """A cell with the numbers of crashes, by how they came about, in the order of ``CRASHES``."""
-    counts = row["crash_kinds"]
-    return "/".join(str(counts[kind]) for kind in CRASHES)
+    return "/".join(str(row["crash_kinds"][kind]) for kind in CRASHES)
 
 
 def score_table(summaries: Sequence[Row], traffics: Sequence[str], notes: Sequence[str]) -> Table:
@@ -65,22 +64,24 @@ def score_table(summaries: Sequence[Row], traffics: Sequence[str], notes: Sequen
 
     def above_mobil(row: Row) -> str:
         # MOBIL itself has no such probability.
-        improvement = row["improvement"].get("mobil", {})
-        return with_interval(improvement, "probability", 2)
+        return with_interval(row["improvement"].get("mobil", {}), "probability", 2)
+
+    # Without intervals, which would make the table too wide.
+    def rate(name: str) -> Cell:
+        return lambda row: number(row[f"{name}_per_1000_km"], 1)
 
     def on(traffic: str) -> Cell:
-        # Without the interval: a suite may have many traffics.
         return lambda row: number(row["by_traffic"][traffic]["normalized_percent"], 1)
 
-    columns: dict[str, Cell] = {
+    columns = {
         "entry": text_of("entry"),
         "n": text_of("trainings"),
         "score [95 %]": number_of("score", 1),
         "worst traffic": worst,
         "crashes": number_of("crashes_per_1000_km", 1),
-        "off road": lambda row: number(row["departures_per_1000_km"], 1),
-        "at fault": lambda row: number(row["at_fault_per_1000_km"], 1),
-        "near misses": lambda row: number(row["near_misses_per_1000_km"], 1),
+        "off road": rate("departures"),
+        "at fault": rate("at_fault"),
+        "near misses": rate("near_misses"),
         "m/s": number_of("mean_speed_mps", 1),
         "P(above MOBIL)": above_mobil,
         "headway s": number_of("least_headway_s", 2),
@@ -97,7 +98,7 @@ def score_table(summaries: Sequence[Row], traffics: Sequence[str], notes: Sequen
 
 def matrix_table(rows: Sequence[Row]) -> Table:
     """Every driver on every traffic; ``rows`` of :func:`ganlane.suite.scores.rows`."""
-    columns: Mapping[str, Cell] = {
+    columns = {
         "driver": text_of("driver"),
         "traffic": text_of("traffic"),
         "episodes": _trainings,
@@ -143,7 +144,7 @@ def comparison_table(rows: Sequence[Row]) -> Table:
             cells.append(f"{crashed_alone}, {test['p_value']:.2g}")
         return "; ".join(cells)
 
-    columns: Mapping[str, Cell] = {
+    columns = {
         "driver": text_of("driver"),
         "over": text_of("over"),
         "traffic": text_of("traffic"),
@@ -182,19 +183,19 @@ def paper_tables(rows: Sequence[Row]) -> list[Table]:
     if not any(row["traffic"] == "gan" and row["driver"] in agents for row in rows):
         return []
 
-    names: Mapping[str, Cell] = {
+    names = {
         "source": lambda row: "here",
         "traffic": text_of("traffic"),
         "driver": text_of("driver"),
         "episodes": _trainings,
     }
-    crashes: Mapping[str, Cell] = {
+    crashes = {
         "hard": text_of("hard_crash"),
         "soft": text_of("soft_crash"),
         "share of hard [95 %, exact]": number_of("hard_crash_share", 4),
         "each training": each("hard_crash", 0),
     }
-    rewards: Mapping[str, Cell] = {
+    rewards = {
         "% of MOBIL": number_of("normalized_percent", 1),
         "mean reward": number_of("mean_reward", 1),
         "sd": number_of("reward_sd", 1),
@@ -202,12 +203,13 @@ def paper_tables(rows: Sequence[Row]) -> list[Table]:
     }
 
     # Columns that the paper does not have stay empty in its lines.
-    lines_vi = []
-    for name, counts in PAPER_VI.items():
-        lines_vi.append(["paper", "Traffic_IDM", name, "not stated", *counts, "", ""])
-    lines_vii = []
-    for name, values in PAPER_VII.items():
-        lines_vii.append(["paper", "Traffic_GAN", name, "1000", *values, ""])
+    lines_vi = [
+        ["paper", "Traffic_IDM", name, "not stated", *counts, "", ""]
+        for name, counts in PAPER_VI.items()
+    ]
+    lines_vii = [
+        ["paper", "Traffic_GAN", name, "1000", *values, ""] for name, values in PAPER_VII.items()
+    ]
 
     return [
         beside(
@@ -255,9 +257,8 @@ def write_report(
         f"<title>{escaped_title}</title><style>{_CSS}</style>"
         f"<h1>{escaped_title}</h1>{body}</html>\n"
     )
-    path = folder / "report.html"
-    write_bytes(path, page.encode())
-    return path
+    write_bytes(folder / "report.html", page.encode())
+    return folder / "report.html"
 
 
 def _html(table: Table) -> str:

@@ -13,11 +13,10 @@ from ganlane.build import Driver, make_driver, make_drivers
 from ganlane.errors import UserError
 from ganlane.evaluation import failed_episodes, machine_sentence, write_results
 from ganlane.evaluation.table import show
-from ganlane.settings.suite import BenchmarkConfig, Suite
+from ganlane.settings.suite import BenchmarkConfig
 from ganlane.sim.random import Stream
 from ganlane.suite import report, scores
 from ganlane.suite.driving import available, drive_episode, drive_suite
-from ganlane.view import Trajectory
 from ganlane.view.player import player_page
 
 #: What a film shows of a failure: so many seconds before it.
@@ -98,8 +97,11 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
         theirs = episodes.filter(pl.col("agent").is_in(trainings))
         entry["decisions_per_s"] = int(theirs["decisions"].sum()) / took_s
 
-    # Pairs of recipes, on the same episodes.
-    compared = scores.comparisons(by_recipe, _pairs(agents, suite))
+    # Every agent against every driver of the suite, then the suite's pairs, each pair once.
+    recipes = dict.fromkeys(scores.recipe_of(driver.name) for driver in agents)
+    pairs = [(recipe, other) for recipe in recipes for other in suite.drivers() if recipe != other]
+    pairs += [(first, second) for first, second in suite.pairs]
+    compared = scores.comparisons(by_recipe, list(dict.fromkeys(pairs)))
 
     # The hash of the protocol tells whether two scores may be compared.
     quick = ", quick" if config.quick else ""
@@ -158,22 +160,6 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
     return f"report: {page}; results: {results}"
 
 
-def _pairs(agents: Sequence[Driver], suite: Suite) -> list[tuple[str, str]]:
-    """Which recipe is compared with which, each pair once, in order.
-
-    Every agent with every driver of the suite, then the suite's pairs.
-    """
-    recipes = dict.fromkeys(scores.recipe_of(driver.name) for driver in agents)
-
-    pairs = []
-    for recipe in recipes:
-        for other in suite.drivers():
-            if recipe != other:
-                pairs.append((recipe, other))
-    pairs += [(first, second) for first, second in suite.pairs]
-    return list(dict.fromkeys(pairs))
-
-
 def _sample(episodes: pl.DataFrame, traffics: Sequence[str]) -> dict[str, Any]:
     """The rewards of the first episodes, by driver and traffic: what anybody can drive again.
 
@@ -200,13 +186,13 @@ def _films(
 
     pages = {}
     for driver in agents:
-        # Number and traffic of every failure: one traffic after the other, crashes first.
+        # Number and traffic of every failure: one traffic after the other, on each crashes first.
         failures = []
         for row in failed_episodes(episodes.filter(pl.col("agent") == driver.name)):
             for number in [*row["hard_crash"], *row["out_of_road"]]:
                 failures.append((number, row["traffic"]))
 
-        shown: list[Trajectory] = []
+        shown = []
         for number, traffic in failures[: config.films]:
             # Driven again, which gives the same episode.
             film = drive_episode(driver, traffics[traffic], config.on(traffic), number)

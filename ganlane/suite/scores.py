@@ -246,6 +246,8 @@ def summaries(cells: Cells, matrix: Sequence[Row], suite: Suite) -> list[Row]:
     scored = list(suite.scored)
     recipes = dict.fromkeys(recipe for recipe, _ in cells)
 
+    names = ("normalized_percent", "normalized_percent_ci")
+
     # By recipe, a table [S, E] for every traffic of the score.
     rewards = {}
     for recipe in recipes:
@@ -259,10 +261,7 @@ def summaries(cells: Cells, matrix: Sequence[Row], suite: Suite) -> list[Row]:
         scores = {}
         for row in matrix:
             if row["driver"] == recipe:
-                scores[row["traffic"]] = {
-                    "normalized_percent": row["normalized_percent"],
-                    "normalized_percent_ci": row["normalized_percent_ci"],
-                }
+                scores[row["traffic"]] = {name: row[name] for name in names}
 
         # The lowest score among those that are decided.
         decided = {}

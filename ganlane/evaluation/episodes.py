@@ -148,9 +148,11 @@ class _Evaluation:
 
         # Who holds something per row outside the tensordict, a foreign simulator for instance,
         # loses it when rows move; a policy has to say that it does not.
-        rows_stay = getattr(getattr(env, "traffic", None), "rows_must_stay", False)
+        traffic = getattr(env, "traffic", None)
+        rows_stay = getattr(traffic, "rows_must_stay", False)
         may_move = not (rows_stay or getattr(policy, "rows_must_stay", True))
         self.make_smaller = make_smaller if may_move else None
+
         # What holds something per row outside the tensordict might not stand being driven on after
         # an end.
         self.check_every = 1 if rows_stay else CHECK_EVERY
@@ -163,6 +165,8 @@ class _Evaluation:
         place = torch.arange(rows, device=env.device).clamp_max(self.total)
         beginning = {"place": place, "marks": first_marks(place)}
         self.rows = TensorDict(beginning, [rows])
+
+        # Rows beyond the list are spare from the start.
         self.driving = place < self.total
         self.handed_out = min(rows, self.total)
         self.finished: list[TensorDictBase] = []
@@ -178,6 +182,7 @@ class _Evaluation:
             [E], in the order of the episodes, on the CPU.
         """
         # Decisions are driven in stretches; between two of them rows are collected and handed out.
+        # To look more often would cost more than the rows that wait.
         done = 0
         while done < self.total:
             for _ in range(self.check_every):
@@ -198,7 +203,7 @@ class _Evaluation:
 
         Nothing is read back from the device, so this never waits.
         """
-        # The policy writes into the tensordict that it reads.
+        # The policy writes its action into the tensordict that it reads.
         after = self.env.step(self.policy(self.state))
         reached = after["next"]
         added = _added(reached)
@@ -215,6 +220,7 @@ class _Evaluation:
             "sums": before["sums"] + added,
             "last": last,
         }
+
         # Rows whose episode has ended keep what they had.
         self.rows = TensorDict(counted, before.batch_size).where(self.driving, before)
 
@@ -231,6 +237,7 @@ class _Evaluation:
         counting = self.rows["place"] < self.total
         ended = (counting & ~self.driving).nonzero()[:, 0]
         if len(ended) > 0:
+            # On the CPU, so that the device holds no more than a batch.
             self.finished.append(self.rows[ended].cpu())
             self.rows["place"][ended] = self.total
         return len(ended)
@@ -250,6 +257,7 @@ class _Evaluation:
         wide = rows > SMALL_BATCH and len(driving) <= LARGEST_SHARE * rows
         if wide and self.handed_out == self.total and self.make_smaller is not None:
             self.env = self.make_smaller(len(driving))
+            # Everything that is held per row goes along.
             for name in ("state", "rows", "driving"):
                 setattr(self, name, getattr(self, name)[driving])
             return
@@ -267,7 +275,8 @@ class _Evaluation:
             total[new] = 0.0
         self.rows["marks"][new] = first_marks(new)
 
-        # Spare rows that have ended start theirs again, uncounted.
+        # Spare rows that have ended start theirs again, uncounted: an environment drives all of its
+        # rows, and from an end none should be driven on.
         mask = self.state["done"] & (place == self.total)[:, None]
         mask[new] = True
         if not bool(mask.any()):
@@ -277,6 +286,7 @@ class _Evaluation:
         number = self.numbers[place.clamp_max(self.total - 1)]
         wanted = torch.where(place < self.total, number, self.state[keys.EPISODE])
         self.state = self.env.reset(self.state.set("_reset", mask), next_episode=wanted)
+
         # An environment that goes on with numbers of its own would fill the table with episodes
         # that nobody asked for.
         if not torch.equal(self.state[keys.EPISODE], wanted):
@@ -288,7 +298,11 @@ class _Evaluation:
 
 
 def _added(state: TensorDictBase) -> TensorDict:
-    """What one decision, which led to ``state``, adds to the sums of its episode; each [N]."""
+    """What one decision, which led to ``state`` [N], adds to the sums of its episode.
+
+    The reward and each of its terms, onsets of soft crashes, and the square of the mean
+    acceleration, (m/s2)^2; each [N].
+    """
     values = {"reward": state[keys.REWARD]}
     for name, term in state.get(keys.REWARD_TERMS, {}).items():
         values[f"reward_{name}"] = term

@@ -23,6 +23,7 @@ LEAST = ("least_ttc_s", "least_headway_s", "hardest_braking_mps2")
 CRASHES = ("run_into", "cut_in", "leaving", "sitting")
 #: A lane change that began at most so long before is what a crash came of, s: it takes some 4 s.
 CHANGE_S = 6.0
+#: The ego among the vehicles, as a slice that leaves a dimension.
 _EGO = slice(0, 1)
 
 
@@ -113,6 +114,10 @@ def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     Along the road whoever is behind moves into the other, across it whoever is faster towards the
     other: a rule of geometry, no law. A driver that cuts in and is struck from behind is not at
     fault by it.
+
+    Args:
+        vehicles: [N, M], the ego first.
+        road: where they drive.
     """
     # The others as seen from the ego, [N, M - 1].
     ahead = road.distance_ahead(vehicles.x[:, :1], vehicles.x[:, 1:])
@@ -155,6 +160,7 @@ def _time_since(distance: Tensor, speed: Tensor, sizes: Tensor) -> Tensor:
     """
     # Distance of two centres at which the bodies touch.
     reach = 0.5 * (sizes[:, 1:] + sizes[:, :1])
+    # How fast they come nearer, below 0 where they part.
     closing = -torch.sign(distance) * speed
     # Both branches are computed, so the divisor is kept above 0.
     overlap_s = (reach - distance.abs()) / closing.clamp_min(1e-9)

@@ -28,7 +28,12 @@ from ganlane.settings.traffic import OwnTraffic, TrafficConfig
 
 @dataclass(frozen=True, repr=False)
 class Run:
-    """A finished command: its run folder and the content of ``results.json``."""
+    """A finished command.
+
+    Attributes:
+        folder: of the run.
+        results: the content of its ``results.json``.
+    """
 
     folder: Path
     results: dict[str, Any]
@@ -111,6 +116,7 @@ def names_of_runs(folders: Sequence[Path]) -> list[str]:
         shared = all(key in settings for settings in runs)
         if shared and len({settings[key] for settings in runs}) > 1:
             differing.append(key)
+
     # Alphabetical, so that the order does not depend on which run comes first.
     differing.sort(key=lambda key: (key == "seed", key))
 
@@ -133,6 +139,7 @@ def _settings(folder: Path) -> dict[str, str]:
         data = saved_config(folder / "config.yaml")
     except UserError:
         return {}
+
     # Which checkpoint a run went on from does not tell what it is.
     data.pop("resume", None)
 
@@ -153,7 +160,12 @@ def _settings(folder: Path) -> dict[str, str]:
 
 
 def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Nested plain data by dotted name; tuples become lists, as when read from a file."""
+    """Nested plain data by dotted name; tuples become lists, as when read from a file.
+
+    Args:
+        nested: mappings in mappings; an empty one is a value.
+        above: what stands before every name, with its dot.
+    """
     names: dict[str, Any] = {}
     for name, value in nested.items():
         if isinstance(value, Mapping) and value:
@@ -164,9 +176,13 @@ def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
 
 
 def runs_below(folder: Path, file: str) -> list[Path]:
-    """The folder itself if it holds ``file``, else the runs of a sweep in it, by number."""
+    """The folder itself if it holds ``file``, else the runs of a sweep in it, by number.
+
+    Only those that hold ``file``; an empty list where none does.
+    """
     if (folder / file).is_file():
         return [folder]
+
     runs = [path.parent for path in folder.glob(f"*/{file}")]
 
     def order(path: Path) -> tuple[bool, int, Path]:
@@ -181,7 +197,7 @@ def runs_below(folder: Path, file: str) -> list[Path]:
 def sweep_rows(folder: Path) -> list[dict[str, Any]]:
     """The rows of all comparisons of a sweep, each with its ``run`` (:func:`names_of_runs`).
 
-    None where the runs are of other commands.
+    No rows where the runs are of other commands.
     """
     runs = runs_below(folder, "results.json")
 
@@ -211,13 +227,16 @@ def as_json(value: Any) -> Any:
     # Records first: they hold everything below.
     if is_dataclass(value) and not isinstance(value, type):
         return as_json(asdict(value))
+
     if isinstance(value, Mapping):
         return {str(key): as_json(item) for key, item in value.items()}
+
     # A tensor or an array becomes nested lists, a scalar of theirs a plain number.
     if isinstance(value, (np.ndarray, np.generic, torch.Tensor)):
         return as_json(value.tolist())
     if isinstance(value, (list, tuple, set, range)):
         return [as_json(item) for item in value]
+
     # JSON has neither NaN nor infinity.
     if isinstance(value, float):
         return value if math.isfinite(value) else None

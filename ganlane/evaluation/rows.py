@@ -46,6 +46,7 @@ FEWEST_FAILURES = 5
 _SIGNIFICANT = 0.05
 _RETURN = pl.col("reward")
 
+#: Numbers by name, as they stand in ``results.json``.
 Row = dict[str, Any]
 
 

@@ -30,6 +30,7 @@ from ganlane.data.statistics import poisson_interval as poisson_bounds
 
 Array = npt.NDArray[np.float64]
 
+#: Of a bootstrap over episodes alone, and of a sign-flip test.
 RESAMPLES = 10_000
 #: Over trainings, since every cell of a matrix needs several of these.
 FEWER_RESAMPLES = 2000
@@ -51,7 +52,13 @@ def _mean(scores: Array) -> Array:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its 95 % interval; the bounds are None where the data are too few."""
+    """A value with its 95 % interval.
+
+    Attributes:
+        value: of the data at hand.
+        low: lower bound of the interval; None where the data are too few.
+        high: upper bound; None where ``low`` is.
+    """
 
     value: float
     low: float | None = None
@@ -80,7 +87,7 @@ class Estimate:
 def entries(name: str, estimate: Estimate | None) -> dict[str, Any]:
     """``{name: value, name_ci: [low, high]}`` for a table's row.
 
-    None for what is missing or not finite.
+    None for what is missing, and for a value that is not finite: JSON has no NaN.
     """
     if estimate is None:
         return {name: None, f"{name}_ci": None}
@@ -109,17 +116,22 @@ def resample_counts(size: int, resamples: int) -> Iterator[Array]:
 
 @lru_cache(maxsize=2)
 def kept_counts(size: int, resamples: int) -> tuple[npt.NDArray[np.uint16], ...]:
-    """The chunks of :func:`resample_counts`.
+    """The chunks of :func:`resample_counts`, for the next interval, in a quarter of the memory.
 
-    A table's intervals draw the same ones, 0.25 s for 1000 episodes.
+    A table's intervals draw the same ones, which takes 0.25 s for 1000 episodes.
     """
     return tuple(counts.astype(np.uint16) for counts in resample_counts(size, resamples))
 
 
 def bootstrap_means(values: Array) -> Array:
-    """Means [R] or [R, K] of resampled ``values`` [E] or [E, K].
+    """Means over resampled episodes.
 
-    The K columns of an episode stay together. R is :data:`RESAMPLES`.
+    Args:
+        values: of E episodes, [E] or [E, K]; the K columns of an episode stay together.
+
+    Returns:
+        [R] or [R, K], with R = :data:`RESAMPLES`. Values of equally many episodes get the same
+        draws.
     """
     size = len(values)
 
@@ -150,6 +162,7 @@ def _bca_levels(values: Array, means: Array) -> Array:
     edge = 0.5 / len(means)
     bias = _NORMAL.inv_cdf(float(np.clip(below, edge, 1.0 - edge)))
 
+    # Efron's corrected levels: without bias and acceleration they are the tail levels themselves.
     levels = []
     for level in TAIL_LEVELS:
         shifted = bias + _NORMAL.inv_cdf(float(level))
@@ -158,9 +171,9 @@ def _bca_levels(values: Array, means: Array) -> Array:
 
 
 def mean_interval(values: npt.ArrayLike) -> Estimate:
-    """Mean of ``values`` [E] with its BCa bootstrap interval.
+    """Mean of ``values`` [E], at least one, with its BCa bootstrap interval.
 
-    No interval for fewer than two values.
+    A single value has no interval. That of equal values has no width.
     """
     data = np.asarray(values, dtype=np.float64)
     mean = float(data.mean())
@@ -194,6 +207,8 @@ def sign_flip_p(differences: npt.ArrayLike) -> float:
 
     # Signs of their own, apart from the draws of the bootstrap.
     generator = np.random.default_rng((0, 2))
+    # How many draws were as far from 0; the data's own signs count as one of them, so that the
+    # probability is never 0.
     as_far = 1
     for start in range(0, RESAMPLES, _CHUNK):
         rows = min(_CHUNK, RESAMPLES - start)
@@ -202,12 +217,16 @@ def sign_flip_p(differences: npt.ArrayLike) -> float:
         sums = signs @ data
         as_far += int((np.abs(sums) >= reached).sum())
 
-    # The data's own signs count as a draw, so that the probability is never 0.
     return as_far / (RESAMPLES + 1)
 
 
 def clopper_pearson(count: int, trials: int) -> Estimate:
-    """Share ``count / trials`` (at least one trial) with its exact binomial interval."""
+    """Share ``count / trials`` with its exact binomial interval.
+
+    Args:
+        count: how often it happened, from 0 to ``trials``.
+        trials: how often it could have happened, at least once.
+    """
     # The bounds are quantiles of beta distributions; the function knows neither end.
     low = 0.0 if count == 0 else float(betaincinv(count, trials - count + 1, _TAIL))
     high = 1.0 if count == trials else float(betaincinv(count + 1, trials - count, 1.0 - _TAIL))
@@ -215,7 +234,10 @@ def clopper_pearson(count: int, trials: int) -> Estimate:
 
 
 def poisson_interval(count: int) -> Estimate:
-    """``count`` observed events with the exact Poisson interval of their expected number."""
+    """``count`` observed events with the exact Poisson interval of their expected number.
+
+    Divided by what was driven (:meth:`Estimate.scaled`) it is a rate.
+    """
     return Estimate(float(count), *poisson_bounds(count))
 
 
@@ -236,29 +258,43 @@ def interquartile_mean(scores: npt.ArrayLike) -> Array:
 
 
 def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Array] = _mean) -> Estimate:
-    """``statistic`` (over the last axis) of the mean scores of trainings [S, E], with its interval.
+    """A statistic of the mean scores of trainings, with its interval.
 
-    No interval where there is one training and one episode.
+    Args:
+        scores: of S trainings in E episodes, [S, E].
+        statistic: of the trainings' means, over the last axis.
+
+    Returns:
+        No interval where there is one training and one episode.
     """
     return _estimate([_table(scores)], statistic)
 
 
 def difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
-    """Mean of ``first`` [S, E] minus mean of ``second`` [S', E], on the same episodes."""
+    """Mean of ``first`` [S, E] minus mean of ``second`` [S', E], on the same episodes.
+
+    The interval is over the episodes, drawn together, and the trainings of both, drawn apart.
+    """
     return _estimate(_pair(first, second), lambda a, b: _mean(a) - _mean(b))
 
 
 def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate | None:
-    """All events over all of ``per`` (km, say), both [S, E]; None where the latter is 0.
+    """All events of S trainings in E episodes, over all that they happened in.
 
     The interval is never narrower than Poisson's exact one for all events together. With several
     trainings its lower bound is at most that of the resampled trainings, and its upper bound is at
     least that of Student's interval on the logarithm's scale: rates of trainings are skewed, so a
     symmetric interval misses high ones.
+
+    Args:
+        events: how many happened, [S, E].
+        per: in how much of what the rate is per, say km, [S, E].
+
+    Returns:
+        None where the whole of ``per`` is 0.
     """
     happened, amount = _pair(events, per)
     total = float(amount.sum())
-    # Also where the sum is not a number.
     if not total > 0.0:
         return None
     if not happened.any():
@@ -281,6 +317,7 @@ def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate |
 
     # Poisson's exact interval for all events together.
     low, high = (bound / total for bound in poisson_bounds(round(happened.sum())))
+
     # One episode of one training has no spread to resample.
     if resampled.low is None or resampled.high is None:
         return Estimate(rate, low, high)
@@ -325,8 +362,15 @@ def improvement_over_traffics(
 ) -> Estimate:
     """How likely a training of one recipe has a higher mean score than one of another; ties half.
 
-    Its mean over ``traffics``, which are the scores [S, E] and [S', E] of each. Where all trainings
-    at hand of one are above all of the other it is 1, from 1 to 1: it says nothing of others.
+    Where all trainings at hand of one are above all of the other it is 1, from 1 to 1: it says
+    nothing of others.
+
+    Args:
+        traffics: for each the scores [S, E] and [S', E] of both recipes, on the same episodes; S
+            and S' are the same on all traffics.
+
+    Returns:
+        The mean of the probabilities over ``traffics``, from 0 to 1.
     """
 
     def share(*means: Array) -> Array:
@@ -340,7 +384,10 @@ def improvement_over_traffics(
 
 
 def percent_of_way(value: Array, top: Array, bottom: Array) -> Array:
-    """How far ``value`` is on the way from ``bottom`` to ``top``, in per cent."""
+    """How far ``value`` is on the way from ``bottom`` to ``top``, in per cent; all of one shape.
+
+    Below 0 before ``bottom``, above 100 beyond ``top``; not finite where both are equal.
+    """
     return np.asarray(100.0 * (value - bottom) / (top - bottom))
 
 
@@ -372,6 +419,7 @@ def mcnemar(first: npt.ArrayLike, second: npt.ArrayLike) -> McNemar:
     b = np.asarray(second, dtype=bool)
     if a.shape != b.shape:
         raise ValueError(f"paired episodes must have one shape, found {a.shape} and {b.shape}")
+
     # Episodes in which both failed, or neither, say nothing about a difference.
     one = int((a & ~b).sum())
     other = int((b & ~a).sum())
@@ -483,4 +531,6 @@ def _share_above(first: Array, second: Array) -> Array:
     # Every training of the first with every training of the second, [R, S, S'].
     a = first[:, :, None]
     b = second[:, None, :]
-    return np.asarray(((a > b) + 0.5 * (a == b)).mean(axis=(1, 2)))
+    # Ties count half.
+    above = (a > b) + 0.5 * (a == b)
+    return np.asarray(above.mean(axis=(1, 2)))

@@ -43,8 +43,10 @@ def aligned(lines: Sequence[Sequence[str]], names: int = 1) -> str:
 def show(*texts: str, columns: str = "auto") -> None:
     """Print texts, a blank line between them.
 
-    Their tables are as wide as the terminal (``columns`` auto) or whole (all). Where the output is
-    no terminal, tables are whole.
+    Args:
+        texts: with tables of :func:`aligned` among their lines.
+        columns: ``auto``: tables are as wide as the terminal, and whole where the output is none;
+            ``all``: they are whole.
     """
     text = "\n\n".join(texts)
     # A file or a pipe gets all columns.
@@ -59,7 +61,8 @@ def fitting(text: str, width: int) -> str:
     A table ends with a blank line; a line below it names what is left out. Columns go from the
     right, those of :data:`_FIRST_TO_GO` before the others.
     """
-    return "\n\n".join(_narrowed(part.split("\n"), width) for part in text.split("\n\n"))
+    parts = text.split("\n\n")
+    return "\n\n".join(_narrowed(part.split("\n"), width) for part in parts)
 
 
 def _narrowed(lines: Sequence[str], width: int) -> str:
@@ -77,7 +80,8 @@ def _narrowed(lines: Sequence[str], width: int) -> str:
         heading = lines[head][span].strip()
         spans[heading] = span
 
-    # Columns go one by one until the rest fits; the first, the name, stays.
+    # Columns go one by one until the rest fits, the least telling first, then from the right. The
+    # first, the name, stays.
     shown = dict(spans)
     for name in [*_FIRST_TO_GO, *reversed(list(spans)[1:])]:
         # Two spaces behind each, but for the last.
@@ -102,7 +106,13 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def with_interval(row: Row, key: str, digits: int = 3) -> str:
-    """A cell with ``row[key]``, and ``[low, high]`` where the row has its interval, ``key_ci``."""
+    """A cell with a number, and ``[low, high]`` where the row has its interval.
+
+    Args:
+        row: holds the number as ``key`` and its interval as ``key_ci``; either may be missing.
+        key: the number's.
+        digits: behind the point.
+    """
     text = number(row.get(key), digits)
     interval = row.get(f"{key}_ci")
     if not interval:
@@ -166,7 +176,7 @@ class Table:
             notes: lines below.
             optional: headings of columns that are left out where no row has anything in them.
         """
-        # Columns that say nothing here make room for those that do.
+        # Columns that say nothing here make room for those that do; a count of 0 says nothing.
         shown = {}
         for heading, cell in columns.items():
             if heading not in optional or any(cell(row) not in ("0", NOTHING) for row in rows):
@@ -226,7 +236,8 @@ _FIRST_TO_GO = (
 def text_table(rows: Sequence[Row]) -> str:
     """The rows of :func:`ganlane.evaluation.evaluation_rows`, also those of a sweep.
 
-    Below them stands a line for each reason why a score is missing.
+    Below them stands a line for each reason why a score is missing, with the traffics on which it
+    holds.
     """
     # Each reason with its traffics, once each.
     reasons: dict[str, list[str]] = {}

@@ -111,6 +111,7 @@ def _batches(rows: list[Recording]) -> list[list[Recording]]:
     # Sorted by shape, so that little is padded.
     for row in sorted(rows, key=lambda row: row.x.shape):
         last = batches[-1] if batches else []
+
         # Every vehicle looks at every other, so memory grows with the square of the largest scene.
         most = max(len(other.length) for other in [row, *last])
         if batches and (len(last) + 1) * most * most <= _MOST_PAIRS:
@@ -145,6 +146,7 @@ def _drive(
     state = recorded.entering(0, excess, traffic)
     waiting = state.valid
     state = state.with_(x=torch.full_like(state.x, _ABSENT_M), valid=~waiting)
+    # Only its shape counts: whoever enters gets a memory of its own.
     _, memory = traffic.enter(state, key, counters[keys.EPISODE])
 
     # Positions of every step, before the step is driven.
@@ -156,6 +158,7 @@ def _drive(
         enters = recorded.may_enter(state, waiting, traffic.road, step)
         waiting = waiting & ~enters
         state = recorded.entering(step, excess, traffic).where(enters, state)
+
         if bool(enters.any()):
             # Drawn for all, and taken for those who enter.
             _, fresh = traffic.enter(state, key, counters[keys.EPISODE])
@@ -268,6 +271,10 @@ class StackedRecordings:
         """Removes vehicles whose recording is over or that passed the end of the road.
 
         Moves replayed ones on.
+
+        Args:
+            state: vehicles [N, M] before ``step``.
+            step: the frame that is to be driven from.
         """
         # Replayed vehicles leave when their recording ends, no earlier.
         on_road = (state.x <= self.end_m + _ROUNDING_M) | ~self.driven
@@ -281,7 +288,14 @@ class StackedRecordings:
     def may_enter(self, state: Vehicles, waiting: Tensor, road: Road, step: int) -> Tensor:
         """Vehicles that enter now, bool [N, M].
 
-        Recorded in this frame, still waiting, and with room in their lane.
+        Recorded in this frame, still waiting, and with room in their lane. At the first frame all
+        enter: they were recorded so.
+
+        Args:
+            state: vehicles [N, M] on the road.
+            waiting: who has not entered yet, [N, M].
+            road: for their lanes.
+            step: the frame.
         """
         wants = self.present[step] & waiting
         # Mostly no vehicle waits, which saves the test of all pairs.
@@ -332,7 +346,11 @@ def with_recorded_headways(
 ) -> TensorDictBase:
     """A traffic's ``memory`` with the headways that the drivers ``who`` [N, M] show as they enter.
 
-    The memory, nested or not, is not modified; one without headways comes back equal.
+    Args:
+        memory: nested or not; it is not modified, and one without headways comes back equal.
+        vehicles: [N, M], those that enter among them.
+        road: for their lanes.
+        who: enters now, [N, M] bool; the others keep their headways.
     """
 
     def shown(name: str | tuple[str, ...], value: Tensor) -> Tensor:
@@ -345,10 +363,13 @@ def with_recorded_headways(
 
 
 class ConstantVelocity(TrafficModule):
-    """Every vehicle keeps its lane and the speed at which it entered."""
+    """Every vehicle keeps its lane and the speed at which it entered.
+
+    Like random driving it ignores all others.
+    """
 
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
-        """One step along the road."""
+        """One step along the road; the memory stays as it is."""
         moved = vehicles.with_(
             x=vehicles.x + vehicles.speed * self.dt,
             acceleration=torch.zeros_like(vehicles.speed),
@@ -374,7 +395,10 @@ class RandomDriving(TrafficModule):
     change_s = 4.0
 
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
-        """One step: the second's acceleration, and towards the target lane."""
+        """One step: the second's acceleration, and towards the target lane.
+
+        The random numbers depend on ``key`` and ``step`` alone; the memory stays as it is.
+        """
         v = vehicles
 
         # One acceleration for the ten steps of a second.

@@ -123,7 +123,10 @@ def jensen_shannon(first: Array, second: Array) -> Array:
 
 
 def pooled_distance(simulated: Array, recorded: Array) -> float:
-    """Distance of two sets of histograms [units, bins], each added up over its units."""
+    """Distance of two sets of histograms [units, bins], each added up over its units.
+
+    NaN where either has no samples.
+    """
     return float(jensen_shannon(simulated.sum(0), recorded.sum(0)))
 
 
@@ -184,13 +187,13 @@ def distance_difference(
     """
     one = pooled_distance(first, recorded)
     other = pooled_distance(second, recorded)
-    ours, theirs = _resampled([first, second], recorded, paired, resamples)
-    units = len(first)
     value = one - other
+    ours, theirs = _resampled([first, second], recorded, paired, resamples)
     if not np.isfinite(value) or len(ours) < 2:
         return Estimate(value)
 
     # S resampled units have (S - 1) / S of the variance that they should have.
+    units = len(first)
     error = float((ours**2 - theirs**2).std()) * np.sqrt(units / (units - 1))
     # From squared distances to distances: two equal models at 0 would divide by zero.
     quantile = float(stdtrit(units - 1, TAIL_LEVELS[1]))
@@ -199,9 +202,15 @@ def distance_difference(
 
 
 def _resampled(models: Sequence[Array], recorded: Array, paired: bool, resamples: int) -> Array:
-    """Distances [models, R] from the R resamples of the units in which all of them are known.
+    """Bootstrapped distances of several models to the recordings.
 
-    None of a single unit.
+    Args:
+        models, recorded: counts, [units, bins] each.
+        paired: resample the units of all together; else those of the models alone.
+        resamples: how many are drawn.
+
+    Returns:
+        [models, R], of the R resamples in which all distances are known; R is 0 for a single unit.
     """
     units = len(recorded) if paired else len(models[0])
     if units < 2:
@@ -220,7 +229,10 @@ def ceiling(recorded: Array) -> float | None:
     """Mean distance of one half of the units [units, bins] to the other, over random halves.
 
     What no model can be expected to beat: halves hold half of the driving, so it errs on the high
-    side. None for one unit.
+    side.
+
+    Returns:
+        None for one unit, and where no half has samples.
     """
     units = len(recorded)
     if units < 2:
@@ -257,7 +269,10 @@ class Measured:
     vehicle_km: float
 
     def summary(self) -> dict[str, Any]:
-        """Lane changes per vehicle-km (:func:`lane_change_rate`) and the ``quantiles``."""
+        """Lane changes per vehicle-km (:func:`lane_change_rate`) and the ``quantiles``.
+
+        What ``results.json`` holds of it, beside the distances.
+        """
         return {
             **lane_change_rate(self.lane_changes, self.vehicle_km),
             "quantiles": self.quantiles,
@@ -319,11 +334,19 @@ def measure(recordings: Sequence[Recording], units: Sequence[str] | None = None)
 
 
 def samples_of(motion: pl.DataFrame) -> dict[str, pl.DataFrame]:
-    """By quantity, columns ``unit`` and ``value``, of a frame :func:`with_motion`."""
+    """The samples of every quantity.
+
+    Args:
+        motion: a frame :func:`with_motion`.
+
+    Returns:
+        By quantity, a row per sample: columns ``unit`` and ``value``, the latter in the unit of
+        :data:`QUANTITIES`.
+    """
     # Only rows that are driven and old enough.
     counted = motion.filter("counts")
 
-    # Leaders are also those that do not count themselves.
+    # Leaders are looked for among all: one that does not count itself is still followed.
     near = pl.col("counts") & pl.col("gap").is_between(0.0, FOLLOWING_M)
     followers = leader_gaps(motion).filter(near).drop_nulls(["speed", "leader_speed"])
     # Near standstill the headway grows without bound.

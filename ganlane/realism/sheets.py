@@ -144,7 +144,10 @@ def long_table(runs: Sequence[Mapping[str, Any]], traffic: str) -> str:
 
 
 def _run_cells(run: Mapping[str, Any], traffic: str) -> dict[str, str]:
-    """A column of :func:`long_table`, by the names of its lines."""
+    """A column of :func:`long_table`, by the names of its lines.
+
+    Rates have their 95 % intervals; ``-`` stands where no vehicle moved or none came so far.
+    """
     cells = {
         f"{short_name(traffic)}, long runs": f"{run['vehicles']} vehicles",
         "vehicle-km": number(run["vehicle_km"], 0),
@@ -166,7 +169,10 @@ def _run_cells(run: Mapping[str, Any], traffic: str) -> dict[str, str]:
 
 
 def short_name(traffic: str) -> str:
-    """A traffic's name without the path that it is imported from."""
+    """A traffic's name without the path that it is imported from.
+
+    ``MyTraffic`` of ``my.module.MyTraffic``; an option's name as it is.
+    """
     return traffic.rpartition(".")[2]
 
 
@@ -183,6 +189,7 @@ def draw(numbers: Mapping[str, Any], starts: Starts, to: Path) -> None:
         # The reference drivers would hide the others.
         if name not in FLOORS:
             totals[short_name(name)] = _pooled(measured)
+
     distributions = draw_distributions(_pooled(starts.recorded), totals)
     save_figure(distributions, to / "distributions.png")
 
@@ -191,7 +198,7 @@ def draw(numbers: Mapping[str, Any], starts: Starts, to: Path) -> None:
 
 
 def _pooled(measured: Measured) -> dict[str, FloatArray]:
-    """By quantity, the counts [bins] over all units."""
+    """By quantity, the counts [bins] over all units: a figure has one line per traffic."""
     return {name: counts.sum(0) for name, counts in measured.counts.items()}
 
 
@@ -201,6 +208,8 @@ def draw_distributions(
     simulated: Mapping[str, Mapping[str, FloatArray]],
 ) -> Figure:
     """A panel per quantity: the recorded density and each traffic's, none where it has no samples.
+
+    All have the bins of :data:`ganlane.realism.measures.QUANTITIES`.
 
     Args:
         recorded: counts [bins] by quantity.
@@ -226,6 +235,7 @@ def draw_distributions(
         for driver, by_quantity in drivers.items():
             _draw_density(axes, edges, by_quantity[name], colours[driver])
 
+    # A legend for the marks at both ends of the densities.
     beyond = Line2D([], [], color=FAINT, label="and all values beyond", marker=">", ls="")
     add_legend(figure, colours, [beyond])
     return figure
@@ -273,7 +283,7 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
     lines = block * len(quantities)
     figure = Figure(figsize=(7.5, 0.8 + 0.125 * lines))
     axes = figure.subplots()
-    # The first line is on top.
+    # Distances go from 0 to 1, and the first line is on top.
     axes.set(xlim=(0, 1), ylim=(lines, 0))
     axes.set_xlabel("Jensen-Shannon distance to recorded driving")
 
@@ -285,6 +295,7 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
     axes.grid(False, axis="y")
 
     for index, row in enumerate(quantities.values()):
+        # A line between two blocks, and the scale across this one.
         top = block * index
         axes.axhline(top, color=GRID, lw=0.8)
         for mark, (_, colour) in scale.items():
@@ -294,6 +305,7 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
         # Traffics in the order of the legend.
         for y, (driver, colour) in enumerate(colours.items(), top + 1):
             shown = row if driver == traffic else row["against"][driver]
+
             # A quantity without samples has no mark.
             value = shown["distance"]
             if value is not None:

@@ -26,6 +26,7 @@ PAPER_VII = {
     "agent_idm": ("5.21", "-22.33", "100.66"),
     "agent_gan": ("114.82", "33.62", "95.19"),
 }
+#: How the page looks: it loads no other file.
 _CSS = """
 body { font: 15px/1.5 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
 body { color: #262a30 }
@@ -73,6 +74,7 @@ def score_table(summaries: Sequence[Row], traffics: Sequence[str], notes: Sequen
     def on(traffic: str) -> Cell:
         return lambda row: number(row["by_traffic"][traffic]["normalized_percent"], 1)
 
+    # Numbers are of all traffics of the score together, but for the last columns.
     columns = {
         "entry": text_of("entry"),
         "n": text_of("trainings"),
@@ -92,6 +94,7 @@ def score_table(summaries: Sequence[Row], traffics: Sequence[str], notes: Sequen
     for traffic in traffics:
         columns[traffic] = on(traffic)
 
+    # A higher score is better.
     best_first = sorted(summaries, key=lambda row: -row["score"])
     return Table.of("", best_first, columns, 1, notes)
 
@@ -137,6 +140,7 @@ def comparison_table(rows: Sequence[Row]) -> Table:
     ``rows`` are those of :func:`ganlane.suite.scores.comparisons`.
     """
 
+    # For each training: in how many episodes it or the other crashed alone, and McNemar's p.
     def tests(row: Row) -> str:
         cells = []
         for test in row["mcnemar"]:
@@ -183,18 +187,21 @@ def paper_tables(rows: Sequence[Row]) -> list[Table]:
     if not any(row["traffic"] == "gan" and row["driver"] in agents for row in rows):
         return []
 
+    # What both tables begin with; the paper's lines have the same.
     names = {
         "source": lambda row: "here",
         "traffic": text_of("traffic"),
         "driver": text_of("driver"),
         "episodes": _trainings,
     }
+    # Table VI: counts of all trainings together, and of each alone.
     crashes = {
         "hard": text_of("hard_crash"),
         "soft": text_of("soft_crash"),
         "share of hard [95 %, exact]": number_of("hard_crash_share", 4),
         "each training": each("hard_crash", 0),
     }
+    # Table VII: means over all trainings, and of each alone.
     rewards = {
         "% of MOBIL": number_of("normalized_percent", 1),
         "mean reward": number_of("mean_reward", 1),
@@ -262,7 +269,7 @@ def write_report(
 
 
 def _html(table: Table) -> str:
-    """A table with its heading above and its notes below."""
+    """A table with its heading above and its notes below, as part of a page."""
 
     # Everything is escaped: names of drivers and traffics come from the user.
     def cells(before: str, texts: Sequence[str], after: str) -> str:

@@ -30,6 +30,10 @@ SAMPLE = 5
 def drivers_of(names: Sequence[str], config: BenchmarkConfig) -> list[Driver]:
     """The drivers of entries by their names; a folder stands for the trainings in it.
 
+    Args:
+        names: of drivers, as a command takes them, files, or folders of a training or a sweep.
+        config: the suite, whose road and vehicles a driver has to fit.
+
     Raises:
         UserError: no such driver, a folder without agents, or one that does not fit.
     """
@@ -74,18 +78,19 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
     suite = config.suite
     scored = list(suite.scored)
 
-    # Only traffics that the score does not need can be left out.
+    # Only traffics that the score does not need can be left out, say for want of a simulator.
     traffics, left_out = available(config)
     for name, reason in left_out.items():
         print(f"left out, {name}: {reason}", file=sys.stderr)
 
-    # A driver of the suite that was entered as an agent drives once.
+    # A driver of the suite that was entered as an agent drives once. The suite's come first, since
+    # the order of the results is that of the drivers.
     entered = {driver.name for driver in agents}
     missing = [name for name in suite.drivers() if name not in entered]
     drivers = [*drivers_of(missing, config), *agents]
     episodes, seconds = drive_suite(drivers, traffics, config)
 
-    # Numbers: by traffic, then over traffics.
+    # From one row per episode to numbers by traffic, and from these to numbers over traffics.
     by_recipe = scores.by_recipe(episodes)
     matrix = scores.rows(by_recipe)
     entries = scores.summaries(by_recipe, matrix, suite)
@@ -107,6 +112,7 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
     quick = ", quick" if config.quick else ""
     title = f"{suite.version}{quick}, protocol {config.protocol()}"
     scale = f"score 0 random_legal, 100 mobil; interquartile mean over {', '.join(scored)}"
+    # Below the table: what the columns are of.
     notes = [
         f"{title}: {scale}.",
         "crashes, off road, at fault, near misses: per 1000 km of all these traffics.",
@@ -115,9 +121,11 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
 
     # Under another protocol the paper's numbers are no comparison.
     paper = report.paper_tables(matrix) if suite.version == "paper" else []
+
     show(table.text(), *(further.text() for further in paper), columns=config.columns)
 
-    # How many episodes of each traffic a training drove.
+    # How many episodes of each traffic a training drove: fewer than asked for where a replayed
+    # traffic has no more starts.
     driven = {row["traffic"]: row["episodes"] for row in matrix}
     counts = ", ".join(f"{count} on {name}" for name, count in driven.items())
     intro = [
@@ -144,13 +152,16 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
         "suite": suite.version,
         "protocol": config.protocol(),
         "quick": config.quick,
+        # Over traffics, by traffic, and by pair.
         "entries": entries,
         "rows": matrix,
         "comparisons": compared,
+        # What anybody can drive again.
         "failures": failed_episodes(episodes),
         "sample": _sample(episodes, scored),
         "left_out": left_out,
     }
+    # With these numbers every episode can be driven again.
     seeds = {
         "stream": suite.stream,
         "seed": config.seed,
@@ -161,7 +172,7 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
 
 
 def _sample(episodes: pl.DataFrame, traffics: Sequence[str]) -> dict[str, Any]:
-    """The rewards of the first episodes, by driver and traffic: what anybody can drive again.
+    """The rewards of the first episodes, by driver and traffic, for whoever drives them again.
 
     Lists of at most :data:`SAMPLE` undiscounted returns, on the ``traffics`` of the score alone.
     """
@@ -194,7 +205,7 @@ def _films(
 
         shown = []
         for number, traffic in failures[: config.films]:
-            # Driven again, which gives the same episode.
+            # Driven again, which gives the same episode; positions were not stored.
             film = drive_episode(driver, traffics[traffic], config.on(traffic), number)
             begins_s = float(film.time_s[-1]) - _SHOWN_S
             shown.append(film.since(max(0.0, begins_s)))

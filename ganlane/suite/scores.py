@@ -34,6 +34,7 @@ from ganlane.evaluation.statistics import (
 )
 from ganlane.settings.suite import Suite
 
+#: Numbers by name, as they stand in ``results.json``.
 Row = dict[str, Any]
 #: Recipe and traffic to the episodes of each training, by driver's name.
 Cells = Mapping[tuple[str, str], Mapping[str, pl.DataFrame]]
@@ -56,7 +57,10 @@ _RATES = {
 
 
 def recipe_of(driver: str) -> str:
-    """``agent_idm+safe`` of ``agent_idm@3+safe`` and of ``FOLDER/agent_idm.safetensors@3+safe``."""
+    """``agent_idm+safe`` of ``agent_idm@3+safe`` and of ``FOLDER/agent_idm.safetensors@3+safe``.
+
+    A driver without a seed is a recipe of its own.
+    """
     # Name, seed and mask: a folder and the file's ending do not belong to the recipe.
     packed = re.fullmatch(r"(?:.*/)?(.+?)(?:\.safetensors)?@\d+(\+.*)?", driver)
     if packed is None:
@@ -69,6 +73,8 @@ def seed_of(driver: str) -> int:
     named = re.search(r"@(\d+)(?:\+|$)", driver)
     if named:
         return int(named[1])
+
+    # Without its mask: it is the same training behind another one.
     name, _, _ = driver.partition("+")
     return SHIPPED.get(name, 0)
 
@@ -122,6 +128,9 @@ def column(trainings: Mapping[str, pl.DataFrame], value: str | pl.Expr) -> Array
 def rows(cells: Cells) -> list[Row]:
     """One row per recipe and traffic.
 
+    Args:
+        cells: of :func:`by_recipe`; MOBIL drove on every traffic.
+
     Returns:
         Per row ``driver, traffic, trainings`` S, ``episodes`` E of each; ``mean_reward``,
         ``interquartile_mean`` (of the trainings' mean rewards) and ``reward_sd`` (over all
@@ -145,7 +154,7 @@ def rows(cells: Cells) -> list[Row]:
 
 def _row(recipe: str, traffic: str, cells: Cells) -> Row:
     """One of :func:`rows`."""
-    # Rewards are [S, E]: trainings by episodes.
+    # Rewards are [S, E]: trainings by episodes, the same episodes for all drivers.
     trainings = cells[recipe, traffic]
     rewards = column(trainings, "reward")
 
@@ -181,7 +190,7 @@ def _row(recipe: str, traffic: str, cells: Cells) -> Row:
 
     # Trainings one by one, so that a reader sees how far they lie apart.
     row["each"] = []
-    # A table [1, E] of each.
+    # Rewards as tables [1, E].
     for (name, frame), alone in zip(trainings.items(), rewards[:, None]):
         training = {
             "driver": name,
@@ -263,7 +272,7 @@ def summaries(cells: Cells, matrix: Sequence[Row], suite: Suite) -> list[Row]:
             if row["driver"] == recipe:
                 scores[row["traffic"]] = {name: row[name] for name in names}
 
-        # The lowest score among those that are decided.
+        # The lowest score among those that are decided; None where MOBIL has no lead anywhere.
         decided = {}
         for traffic in scored:
             percent = scores[traffic]["normalized_percent"]
@@ -302,6 +311,10 @@ def summaries(cells: Cells, matrix: Sequence[Row], suite: Suite) -> list[Row]:
 def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
     """Recipes compared on every traffic that both drove on.
 
+    Args:
+        cells: of :func:`by_recipe`.
+        pairs: recipes, first and second.
+
     Returns:
         Per pair and traffic ``driver, over, traffic, lead`` (difference of mean rewards),
         ``probability`` (that a training of the first is above one of the second),
@@ -315,6 +328,7 @@ def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
             # Somebody may not have driven on a traffic, or nowhere.
             if recipe != one or (other, traffic) not in cells:
                 continue
+
             compared.append(
                 {
                     "driver": one,
@@ -360,13 +374,15 @@ def _compared(first: Mapping[str, pl.DataFrame], second: Mapping[str, pl.DataFra
 def _crash_difference(first: Array, second: Array) -> Estimate:
     """Difference of the shares of episodes with a crash.
 
-    Where there is none, resampling would leave no doubt.
+    Args:
+        first: 1 for a crash, [S, E].
+        second: the same on the same episodes, [S', E].
     """
     if first.any() or second.any():
         return difference(first, second)
 
-    # Nobody crashed, which is no proof that nobody would: the exact bound of no crash in E
-    # episodes.
+    # Nobody crashed, and resampling would leave no doubt. That is no proof that nobody would crash,
+    # so the interval is the exact bound of no crash in E episodes, to both sides.
     most = clopper_pearson(0, first.shape[1]).high or 0.0
     return Estimate(0.0, -most, most)
 

@@ -84,26 +84,39 @@ def run_episodes(
         raise UserError(
             f"env: batch size {shape} was found, expected [N]; build the environment with N rows."
         )
+
     numbers = list(episodes)
     # Noisy layers and epsilon-greedy stay off: a table is about the learnt policy.
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        driven = _Evaluation(env, policy, numbers, seed, make_smaller).run(on_progress)
-    return _episode_rows(driven, numbers, seed, getattr(env, "road", STRAIGHT))
+        evaluation = _Evaluation(env, policy, numbers, seed, make_smaller)
+        driven = evaluation.run(on_progress)
+
+    return _episode_rows(driven, numbers, seed, evaluation.road)
 
 
 def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
     """The tensordict that makes ``env.reset`` start these episodes.
 
-    The last one also fills the rows left over. :class:`UserError` for none.
+    Args:
+        env: batched environment, batch size ``[N]``.
+        numbers: of the episodes, from 1 to N; the last one also fills the rows left over.
+        seed: of all of them.
+
+    Raises:
+        UserError: there are no numbers.
     """
     if len(numbers) == 0:
         raise UserError(
             "episodes: none were asked for; expected at least one, give for instance episodes=100."
         )
     rows = env.batch_size[0]
-    padded = [*numbers, *[numbers[-1]] * (rows - len(numbers))]
+    spare = rows - len(numbers)
+    padded = [*numbers, *[numbers[-1]] * spare]
     episode = torch.tensor(padded, dtype=torch.int64, device=env.device)
-    counters = {keys.SEED: torch.full_like(episode, seed), keys.EPISODE: episode}
+    counters = {
+        keys.SEED: torch.full_like(episode, seed),
+        keys.EPISODE: episode,
+    }
     return TensorDict(counters, [rows], device=env.device)
 
 
@@ -111,6 +124,14 @@ class _Evaluation:
     """Episodes on their way through the rows of an environment.
 
     Arguments as in :func:`run_episodes`.
+
+    Attributes:
+        total: E, the number of episodes.
+        handed_out: how many of them a row has begun.
+        finished: what the episodes gave that have ended, on the CPU, in the order of their ends.
+        state: where the rows are, [N].
+        driving: rows [N] bool whose episode counts and has not ended.
+        rows: of each row ``place``, ``marks``, ``sums`` and ``last``.
     """
 
     def __init__(
@@ -121,45 +142,59 @@ class _Evaluation:
         seed: int,
         make_smaller: Callable[[int], EnvBase] | None,
     ) -> None:
-        rows = env.batch_size[0]
-        self.total = len(numbers)
-        # Who holds something per row outside the tensordict, a foreign simulator for instance,
-        # loses it when rows move; a policy has to say that it does not.
-        rows_stay = getattr(getattr(env, "traffic", None), "rows_must_stay", False)
-        may_move = not (rows_stay or getattr(policy, "rows_must_stay", True))
         self.env = env
         self.policy = policy
+        self.total = len(numbers)
+
+        # Who holds something per row outside the tensordict, a foreign simulator for instance,
+        # loses it when rows move; a policy has to say that it does not.
+        traffic = getattr(env, "traffic", None)
+        rows_stay = getattr(traffic, "rows_must_stay", False)
+        may_move = not (rows_stay or getattr(policy, "rows_must_stay", True))
         self.make_smaller = make_smaller if may_move else None
+
         # What holds something per row outside the tensordict might not stand being driven on after
         # an end.
         self.check_every = 1 if rows_stay else CHECK_EVERY
+
+        rows = env.batch_size[0]
         self.numbers = torch.tensor(numbers, dtype=torch.int64, device=env.device)
         # Of each row where its episode stands in the list (the list's length in spare rows) and
         # what is marked; from the first decision on also the sums over the decisions of its
         # episode, and the last state of it.
         place = torch.arange(rows, device=env.device).clamp_max(self.total)
-        self.rows = TensorDict({"place": place, "marks": first_marks(place)}, [rows])
+        beginning = {"place": place, "marks": first_marks(place)}
+        self.rows = TensorDict(beginning, [rows])
+
+        # Rows beyond the list are spare from the start.
         self.driving = place < self.total
         self.handed_out = min(rows, self.total)
         self.finished: list[TensorDictBase] = []
+
         self.state: TensorDictBase = env.reset(start_of(env, numbers[:rows], seed))
         self.road = getattr(env, "road", STRAIGHT)
 
     def run(self, on_progress: Callable[[int, int], None] | None) -> TensorDictBase:
         """Drive all episodes to their ends.
 
-        Returns ``sums``, ``last`` and ``marks`` [E] in the order of the episodes, on the CPU.
+        Returns:
+            ``sums`` over the decisions of each episode, its ``last`` state, and its ``marks``, each
+            [E], in the order of the episodes, on the CPU.
         """
         # Decisions are driven in stretches; between two of them rows are collected and handed out.
+        # To look more often would cost more than the rows that wait.
         done = 0
         while done < self.total:
             for _ in range(self.check_every):
                 self._decide()
+
             done += self._collect()
             if on_progress is not None:
                 on_progress(done, self.total)
             if done < self.total:
                 self._go_on()
+
+        # Episodes end in any order.
         driven: TensorDictBase = torch.cat(self.finished)  # type: ignore[assignment, arg-type]
         return driven[driven["place"].argsort()]
 
@@ -168,23 +203,29 @@ class _Evaluation:
 
         Nothing is read back from the device, so this never waits.
         """
-        # The policy writes into the tensordict that it reads.
+        # The policy writes its action into the tensordict that it reads.
         after = self.env.step(self.policy(self.state))
-        added = _added(after["next"])
-        last = after["next"].select(*_LAST, strict=False)
+        reached = after["next"]
+        added = _added(reached)
+        last = reached.select(*_LAST, strict=False)
+
+        # Which sums there are depends on the environment's reward, which the first step shows.
         before = self.rows
         if "sums" not in before:
             before.update({"sums": added.apply(torch.zeros_like), "last": last})
+
         counted = {
             "place": before["place"],
-            "marks": marks_after(after["next"], before["marks"], self.road),
+            "marks": marks_after(reached, before["marks"], self.road),
             "sums": before["sums"] + added,
             "last": last,
         }
+
         # Rows whose episode has ended keep what they had.
         self.rows = TensorDict(counted, before.batch_size).where(self.driving, before)
+
         # From its first end on a row counts no more, whatever it drives.
-        self.driving = self.driving & ~after["next", "done"].squeeze(-1)
+        self.driving = self.driving & ~reached["done"].squeeze(-1)
         self.state = step_mdp(after)
 
     def _collect(self) -> int:
@@ -193,8 +234,10 @@ class _Evaluation:
         Their rows are spare then.
         """
         # A row is counted until its first end, even where it is driven on until the next look.
-        ended = ((self.rows["place"] < self.total) & ~self.driving).nonzero()[:, 0]
+        counting = self.rows["place"] < self.total
+        ended = (counting & ~self.driving).nonzero()[:, 0]
         if len(ended) > 0:
+            # On the CPU, so that the device holds no more than a batch.
             self.finished.append(self.rows[ended].cpu())
             self.rows["place"][ended] = self.total
         return len(ended)
@@ -203,34 +246,47 @@ class _Evaluation:
         """Give spare rows the next episodes.
 
         Without any, start the last ones again or leave such rows out.
+
+        Raises:
+            UserError: the environment's reset ignores ``next_episode``.
         """
         driving = self.driving.nonzero()[:, 0]
         rows = self.env.batch_size[0]
+
         # Nothing is left to hand out, and rows are spare: a smaller batch is faster.
         wide = rows > SMALL_BATCH and len(driving) <= LARGEST_SHARE * rows
         if wide and self.handed_out == self.total and self.make_smaller is not None:
             self.env = self.make_smaller(len(driving))
+            # Everything that is held per row goes along.
             for name in ("state", "rows", "driving"):
                 setattr(self, name, getattr(self, name)[driving])
             return
+
         # Spare rows take the next numbers of the list, in order.
-        new = (~self.driving).nonzero()[: self.total - self.handed_out, 0]
+        waiting = self.total - self.handed_out
+        new = (~self.driving).nonzero()[:waiting, 0]
         place = self.rows["place"]
         place[new] = torch.arange(len(new), device=place.device) + self.handed_out
         self.handed_out += len(new)
         self.driving[new] = True
+
         # The sums of a row begin anew with its episode.
         for total in self.rows["sums"].values():
             total[new] = 0.0
         self.rows["marks"][new] = first_marks(new)
-        # Spare rows that have ended start theirs again, uncounted.
+
+        # Spare rows that have ended start theirs again, uncounted: an environment drives all of its
+        # rows, and from an end none should be driven on.
         mask = self.state["done"] & (place == self.total)[:, None]
         mask[new] = True
         if not bool(mask.any()):
             return
+
+        # Whose place is beyond the list stays with the number that it had.
         number = self.numbers[place.clamp_max(self.total - 1)]
         wanted = torch.where(place < self.total, number, self.state[keys.EPISODE])
         self.state = self.env.reset(self.state.set("_reset", mask), next_episode=wanted)
+
         # An environment that goes on with numbers of its own would fill the table with episodes
         # that nobody asked for.
         if not torch.equal(self.state[keys.EPISODE], wanted):
@@ -242,44 +298,66 @@ class _Evaluation:
 
 
 def _added(state: TensorDictBase) -> TensorDict:
-    """What one decision, which led to ``state``, adds to the sums of its episode; each [N]."""
-    rows = state.batch_size
+    """What one decision, which led to ``state`` [N], adds to the sums of its episode.
+
+    The reward and each of its terms, onsets of soft crashes, and the square of the mean
+    acceleration, (m/s2)^2; each [N].
+    """
     values = {"reward": state[keys.REWARD]}
-    # Double precision: thousands of small rewards are summed.
     for name, term in state.get(keys.REWARD_TERMS, {}).items():
         values[f"reward_{name}"] = term
     for name in (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND):
         values[name] = state[keys.EVENTS, name]
     values["squared_acceleration"] = state[keys.EGO, "mean_acceleration"].double().square()
-    return TensorDict({name: value.reshape(rows).double() for name, value in values.items()}, rows)
+
+    # Double precision: thousands of small rewards are summed.
+    rows = state.batch_size
+    doubles = {name: value.reshape(rows).double() for name, value in values.items()}
+    return TensorDict(doubles, rows)
 
 
 def _episode_rows(
     driven: TensorDictBase, numbers: list[int], seed: int, road: Road
 ) -> pl.DataFrame:
-    """What :func:`run_episodes` returns without being asked for more."""
+    """What :func:`run_episodes` returns.
+
+    Args:
+        driven: of :meth:`_Evaluation.run`, [E].
+        numbers: of the episodes.
+        seed: of all of them.
+        road: where the states say nothing of theirs.
+    """
     last = driven["last"]
-    ego = driven["last", keys.EGO]
+    ego = last[keys.EGO]
+    marks = driven["marks"]
+
     # One column per count, each [E].
     columns = dict(driven["sums"].items())
-    columns |= {name: last[keys.EVENTS, name].squeeze(-1) for name in keys.END_EVENTS}
+    for name in keys.END_EVENTS:
+        columns[name] = last[keys.EVENTS, name].squeeze(-1)
     # What the ego counts itself since its episode began.
-    columns |= {name: ego[name] for name in ("distance", "lane_changes", "decisions")}
+    for name in ("distance", "lane_changes", "decisions"):
+        columns[name] = ego[name]
     columns["duration_s"] = last[keys.STEP].double() * keys.PHYSICS_STEP_S
-    marks = driven["marks"]
     columns |= dict(marks.items())
+
     # A state without vehicles tells nothing about a crash.
     kinds: list[str | None] = [None] * len(numbers)
     if keys.VEHICLES in last:
         vehicles = Vehicles.of(last[keys.VEHICLES])
         since_s = columns["duration_s"] - marks["change_s"]
         kinds[:] = crash_kinds(vehicles, since_s, road_in(last, road))
+    # Every row has a kind, as if it had crashed.
     crash = pl.when("hard_crash").then(pl.Series("crash", kinds, pl.String))
+
     # The reward's terms are the environment's own, so their names are not known here.
     terms = [name for name in columns if name.startswith("reward_")]
+    # The first event that happened is the reason.
     ends = [pl.when(pl.col(event)).then(pl.lit(event)) for event in keys.END_EVENTS]
     distance = pl.col("distance").cast(pl.Float64)
     duration = pl.col("duration_s")
+    mean_square = pl.col("squared_acceleration") / pl.col("decisions")
+
     table = pl.DataFrame({name: value.numpy() for name, value in columns.items()})
     return table.select(
         pl.Series("episode", numbers, pl.Int64),
@@ -300,5 +378,5 @@ def _episode_rows(
         (crash == CRASHES[0]).alias("at_fault"),
         crash,
         *LEAST,
-        rms_acceleration_mps2=(pl.col("squared_acceleration") / pl.col("decisions")).sqrt(),
+        rms_acceleration_mps2=mean_square.sqrt(),
     )

@@ -23,6 +23,7 @@ LEAST = ("least_ttc_s", "least_headway_s", "hardest_braking_mps2")
 CRASHES = ("run_into", "cut_in", "leaving", "sitting")
 #: A lane change that began at most so long before is what a crash came of, s: it takes some 4 s.
 CHANGE_S = 6.0
+#: The ego among the vehicles, as a slice that leaves a dimension.
 _EGO = slice(0, 1)
 
 
@@ -30,6 +31,9 @@ def first_marks(rows: Tensor) -> TensorDict:
     """The marks of rows whose episode begins, for ``rows`` of any type, [N].
 
     Nothing has come near, nobody has braked, and the last lane change is endlessly long ago.
+
+    Returns:
+        :data:`LEAST` and ``change_s``, as :func:`marks_after` updates them, each [N].
     """
     endless = torch.full(rows.shape, torch.inf, device=rows.device)
     marks = dict.fromkeys(LEAST, endless)
@@ -42,11 +46,18 @@ def first_marks(rows: Tensor) -> TensorDict:
 def marks_after(state: TensorDictBase, marks: TensorDictBase, road: Road) -> TensorDictBase:
     """``marks`` [N] after the decision that led to ``state`` [N].
 
-    :data:`LEAST`, and ``change_s``, the time at which the last lane change began, s. An environment
-    without ``vehicles`` has no marks to update.
+    Args:
+        state: after the decision; one without ``vehicles`` says nothing of marks.
+        marks: before it, of :func:`first_marks` or from here; not modified.
+        road: where the state says nothing of its road.
+
+    Returns:
+        :data:`LEAST`, the smallest values of the episode so far, and ``change_s``, the time at
+        which the last lane change began, s.
     """
     if keys.VEHICLES not in state:
         return marks
+
     ego = state[keys.EGO]
     vehicles = Vehicles.of(state[keys.VEHICLES])
     here = road_in(state, road)
@@ -58,14 +69,18 @@ def marks_after(state: TensorDictBase, marks: TensorDictBase, road: Road) -> Ten
     gap_m = ahead.gap[:, 0].clamp_min(0.0)
     speed = vehicles.speed[:, 0]
     closing = speed - ahead.speed[:, 0]
+    # Who is no faster than the one ahead, or stands, comes no nearer.
+    ttc_s = torch.where(closing > 0.0, gap_m / closing, torch.inf)
+    headway_s = torch.where(speed > 0.0, gap_m / speed, torch.inf)
 
     now = {
-        "least_ttc_s": torch.where(closing > 0.0, gap_m / closing, torch.inf),
-        "least_headway_s": torch.where(speed > 0.0, gap_m / speed, torch.inf),
+        "least_ttc_s": ttc_s,
+        "least_headway_s": headway_s,
         "hardest_braking_mps2": ego["mean_acceleration"],
     }
     updated = {name: torch.minimum(marks[name], value.float()) for name, value in now.items()}
 
+    # The environment says at the end of a decision whether one began in it.
     time_s = state[keys.STEP] * keys.PHYSICS_STEP_S
     updated["change_s"] = torch.where(ego["started_change"], time_s.float(), marks["change_s"])
     return TensorDict(updated, marks.batch_size)
@@ -77,10 +92,13 @@ def crash_kinds(vehicles: Vehicles, since_s: Tensor, road: Road = STRAIGHT) -> l
     Args:
         vehicles: [N, M], the ego first.
         since_s: time since the ego's last lane change began, s, [N].
+        road: where they drive.
     """
+    # Of the others, [N, M - 1].
     hit = ego_overlaps(vehicles, road)
     lanes = road.lane_of(vehicles.y[:, 1:])
-    in_chosen_lane = (hit & (lanes == vehicles.target_lane[:, _EGO])).any(-1)
+    chosen_lane = vehicles.target_lane[:, _EGO]
+    in_chosen_lane = (hit & (lanes == chosen_lane)).any(-1)
 
     # Indices into CRASHES. Soon after a change: struck in the lane chosen, or in the one left.
     struck = torch.where(in_chosen_lane, 1, 2)
@@ -96,6 +114,10 @@ def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     Along the road whoever is behind moves into the other, across it whoever is faster towards the
     other: a rule of geometry, no law. A driver that cuts in and is struck from behind is not at
     fault by it.
+
+    Args:
+        vehicles: [N, M], the ego first.
+        road: where they drive.
     """
     # The others as seen from the ego, [N, M - 1].
     ahead = road.distance_ahead(vehicles.x[:, :1], vehicles.x[:, 1:])
@@ -114,10 +136,12 @@ def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     at_fault = torch.where(since_along < since_across, ahead > 0, pushes)
     into_somebody = (at_fault & ego_overlaps(vehicles, road)).any(-1)
 
+    # Whoever hits the wall at the end of a lane has moved into it.
     if not road.has_lane_ends:
         return into_somebody
     ego = vehicles.columns(_EGO)
-    return into_somebody | hits_wall(ego, body_lanes(ego, road), road)[:, 0]
+    into_wall = hits_wall(ego, body_lanes(ego, road), road)
+    return into_somebody | into_wall[:, 0]
 
 
 def _gain(values: Tensor) -> Tensor:
@@ -136,6 +160,7 @@ def _time_since(distance: Tensor, speed: Tensor, sizes: Tensor) -> Tensor:
     """
     # Distance of two centres at which the bodies touch.
     reach = 0.5 * (sizes[:, 1:] + sizes[:, :1])
+    # How fast they come nearer, below 0 where they part.
     closing = -torch.sign(distance) * speed
     # Both branches are computed, so the divisor is kept above 0.
     overlap_s = (reach - distance.abs()) / closing.clamp_min(1e-9)

@@ -28,7 +28,12 @@ from ganlane.settings.traffic import OwnTraffic, TrafficConfig
 
 @dataclass(frozen=True, repr=False)
 class Run:
-    """A finished command: its run folder and the content of ``results.json``."""
+    """A finished command.
+
+    Attributes:
+        folder: of the run.
+        results: the content of its ``results.json``.
+    """
 
     folder: Path
     results: dict[str, Any]
@@ -49,6 +54,7 @@ class Run:
             rows = [
                 {key: value for key, value in self.results.items() if isinstance(value, single)}
             ]
+
         table = pl.DataFrame(rows, infer_schema_length=None)._repr_html_()
         return f"<p>{escape(str(self.folder))}</p>{table}"
 
@@ -76,6 +82,7 @@ def write_results(
         seeds: the seeds and episode numbers behind the numbers.
     """
     path = Path(folder) / "results.json"
+
     # Whoever finds the file later can tell where its numbers come from.
     content = {
         **numbers,
@@ -94,14 +101,29 @@ def names_of_runs(folders: Sequence[Path]) -> list[str]:
 
     ``seed=0`` comes last. Two runs of the same settings, or one without its settings, are named by
     the ends of their paths.
+
+    Args:
+        folders: of the runs, each with its ``config.yaml``.
+
+    Returns:
+        A name for each of them, in their order.
     """
     runs = [_settings(folder) for folder in folders]
-    # A key that some lack belongs to a traffic or a scene that they do not have.
-    shared = [key for key in runs[0] if all(key in settings for settings in runs)] if runs else []
-    differing = [key for key in shared if len({settings[key] for settings in runs}) > 1]
+
+    differing = []
+    for key in runs[0] if runs else ():
+        # A key that some lack belongs to a traffic or a scene that they do not have.
+        shared = all(key in settings for settings in runs)
+        if shared and len({settings[key] for settings in runs}) > 1:
+            differing.append(key)
+
     # Alphabetical, so that the order does not depend on which run comes first.
     differing.sort(key=lambda key: (key == "seed", key))
-    names = [", ".join(f"{key}={settings[key]}" for key in differing) for settings in runs]
+
+    names = []
+    for settings in runs:
+        names.append(", ".join(f"{key}={settings[key]}" for key in differing))
+
     # Paths from the right, as long as it takes to tell all of them apart.
     longest = max((len(folder.parts) for folder in folders), default=0)
     for depth in range(1, longest + 1):
@@ -117,8 +139,10 @@ def _settings(folder: Path) -> dict[str, str]:
         data = saved_config(folder / "config.yaml")
     except UserError:
         return {}
+
     # Which checkpoint a run went on from does not tell what it is.
     data.pop("resume", None)
+
     settings = {}
     for key, value in flat(data).items():
         owner, _, name = key.rpartition(".")
@@ -128,13 +152,20 @@ def _settings(folder: Path) -> dict[str, str]:
             settings[owner] = kind.option or as_typed(value)  # type: ignore[attr-defined]
         else:
             settings[key] = as_typed(value)
+
+    # The traffics of an evaluation by their names alone.
     if isinstance(data.get("traffics"), Mapping):
         settings["traffics"] = as_typed(list(data["traffics"]))
     return settings
 
 
 def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Nested plain data by dotted name; tuples become lists, as when read from a file."""
+    """Nested plain data by dotted name; tuples become lists, as when read from a file.
+
+    Args:
+        nested: mappings in mappings; an empty one is a value.
+        above: what stands before every name, with its dot.
+    """
     names: dict[str, Any] = {}
     for name, value in nested.items():
         if isinstance(value, Mapping) and value:
@@ -145,26 +176,36 @@ def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
 
 
 def runs_below(folder: Path, file: str) -> list[Path]:
-    """The folder itself if it holds ``file``, else the runs of a sweep in it, by number."""
+    """The folder itself if it holds ``file``, else the runs of a sweep in it, by number.
+
+    Only those that hold ``file``; an empty list where none does.
+    """
     if (folder / file).is_file():
         return [folder]
+
     runs = [path.parent for path in folder.glob(f"*/{file}")]
 
     def order(path: Path) -> tuple[bool, int, Path]:
-        job = path.name.isdigit()
-        return not job, int(path.name) if job else 0, path
+        if path.name.isdigit():
+            return False, int(path.name), path
+        return True, 0, path
 
     # Job 10 comes after job 9, and what is not a job after all of them.
     return sorted(runs, key=order)
 
 
 def sweep_rows(folder: Path) -> list[dict[str, Any]]:
-    """The rows of all comparisons of a sweep, each with its ``run`` (:func:`names_of_runs`)."""
+    """The rows of all comparisons of a sweep, each with its ``run`` (:func:`names_of_runs`).
+
+    No rows where the runs are of other commands.
+    """
     runs = runs_below(folder, "results.json")
+
     rows = []
     for name, run in zip(names_of_runs(runs), runs):
         record = json.loads((run / "results.json").read_text(encoding="utf-8"))
         rows += [{"run": name, **row} for row in record.get("rows") or []]
+
     # Rows of other commands have other columns, so they make no common table.
     return rows if all("mean_reward" in row for row in rows) else []
 
@@ -186,17 +227,23 @@ def as_json(value: Any) -> Any:
     # Records first: they hold everything below.
     if is_dataclass(value) and not isinstance(value, type):
         return as_json(asdict(value))
+
     if isinstance(value, Mapping):
         return {str(key): as_json(item) for key, item in value.items()}
+
     # A tensor or an array becomes nested lists, a scalar of theirs a plain number.
     if isinstance(value, (np.ndarray, np.generic, torch.Tensor)):
         return as_json(value.tolist())
     if isinstance(value, (list, tuple, set, range)):
         return [as_json(item) for item in value]
+
     # JSON has neither NaN nor infinity.
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, (bool, int, str)) else str(value)
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    # Paths and the like.
+    return str(value)
 
 
 def code_version() -> dict[str, Any]:
@@ -206,9 +253,11 @@ def code_version() -> dict[str, Any]:
     own file.
     """
     # None where git does not know: an installed package, or a machine without git.
-    revision = modified = None
+    revision = None
+    modified = None
     if _git("ls-files", "--error-unmatch", "__init__.py") is not None:
         revision = _git("rev-parse", "HEAD")
+        # The package alone: changed tests or docs change no number.
         modified = bool(_git("status", "--porcelain", "--untracked-files=no", "--", "."))
     return {"version": __version__, "revision": revision, "modified": modified}
 
@@ -226,17 +275,20 @@ def _git(*arguments: str) -> str | None:
 def machine() -> dict[str, Any]:
     """CPU, usable cores, torch's threads, system, accelerator (or None), versions that ran."""
     cpu = platform.processor() or platform.machine()
+
     # Linux names the model of the CPU here.
     info = Path("/proc/cpuinfo")
     if info.is_file():
         model = re.search(r"(?m)^model name\s*:(.*)$", info.read_text(errors="replace"))
         cpu = model[1].strip() if model else cpu
+
+    accelerator = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     return {
         "cpu": cpu,
         "cores": usable_cores(),
         "threads": torch.get_num_threads(),
         "system": platform.platform(),
-        "accelerator": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "accelerator": accelerator,
         "python": platform.python_version(),
         "torch": torch.__version__,
     }
@@ -249,12 +301,17 @@ def machine_sentence(threads: Sequence[int]) -> str:
     """
     here = machine()
     code = code_version()
-    # The model of CPU and accelerator decides about speed, the versions about digits.
-    hardware = f"{here['cpu']}, {here['cores']} usable core{'s' if here['cores'] != 1 else ''}"
+
+    # The model of CPU and accelerator decides about speed.
+    plural = "s" if here["cores"] != 1 else ""
+    hardware = f"{here['cpu']}, {here['cores']} usable core{plural}"
     if here["accelerator"]:
         hardware += f", {here['accelerator']}"
+
+    # The versions decide about digits.
+    used = f"Python {here['python']}, torch {here['torch']}"
     version = f"ganlane {code['version']}"
     if code["revision"]:
-        version += f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})"
-    used = f"Python {here['python']}, torch {here['torch']}"
+        modified = ", modified" if code["modified"] else ""
+        version += f" ({code['revision'][:12]}{modified})"
     return f"{hardware}; {used} (threads: {', '.join(map(str, threads))}); {version}."

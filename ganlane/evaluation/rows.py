@@ -42,9 +42,11 @@ FAILURES = (_CRASH, "out_of_road")
 FEWEST_EPISODES = 30
 #: A verdict may not hang on fewer failures than this.
 FEWEST_FAILURES = 5
+#: A verdict needs a sign-flip test of at most this probability.
 _SIGNIFICANT = 0.05
 _RETURN = pl.col("reward")
 
+#: Numbers by name, as they stand in ``results.json``.
 Row = dict[str, Any]
 
 
@@ -67,8 +69,11 @@ def evaluation_rows(episodes: pl.DataFrame) -> list[Row]:
         ``_ci`` holds the 95 % interval of its namesake as ``[low, high]``, or None.
     """
     # Partitions keep the order of the command line.
-    pairs = episodes.partition_by(["agent", "traffic"], maintain_order=True)
-    return [_row(pair, episodes.filter(pl.col("traffic") == pair["traffic"][0])) for pair in pairs]
+    rows = []
+    for pair in episodes.partition_by(["agent", "traffic"], maintain_order=True):
+        same_traffic = episodes.filter(pl.col("traffic") == pair["traffic"][0])
+        rows.append(_row(pair, same_traffic))
+    return rows
 
 
 def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
@@ -76,20 +81,28 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
 
     ``same_traffic`` also holds the drivers that give the scale.
     """
+    returns = pair["reward"].to_numpy()
     # Every end has its column, also one that never happened.
     ended = counts_of_ends(pair, keys.END_EVENTS)
-    returns = pair["reward"].to_numpy()
+    crash_share = clopper_pearson(ended["hard_crash"], pair.height)
+    departure_share = clopper_pearson(ended["out_of_road"], pair.height)
+
+    # Per 1000 km, from m.
     distance_m = float(pair["distance_m"].sum())
-    crashes = lead = None
+    crashes = None
     if distance_m > 0.0:
         crashes = poisson_interval(ended[_CRASH]).scaled(1e6 / distance_m)
+
     # MOBIL has no lead over itself, and without it nobody has one.
+    lead = None
     returns_of_both = _paired(pair, same_traffic.filter(pl.col("agent") == SCALE_TOP))
     if pair["agent"][0] != SCALE_TOP and len(returns_of_both[0]) > 1:
         lead = paired_difference(*returns_of_both)
+
     # Someone close behind is no end of an episode, so it is counted by episode.
     behind = mean_interval(pair["soft_crash_behind"].to_numpy())
     score, reason = _score(pair, same_traffic)
+
     return {
         "agent": pair["agent"][0],
         "traffic": pair["traffic"][0],
@@ -108,8 +121,8 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
         "reward_sd": float(np.std(returns, ddof=1)) if len(returns) > 1 else None,
         **speed_and_lane_changes(pair),
         "distance_km": distance_m / 1000.0,
-        **entries("hard_crash_share", clopper_pearson(ended["hard_crash"], pair.height)),
-        **entries("out_of_road_share", clopper_pearson(ended["out_of_road"], pair.height)),
+        **entries("hard_crash_share", crash_share),
+        **entries("out_of_road_share", departure_share),
         **entries("crashes_per_1000_km", crashes),
         **entries("minus_mobil", lead),
         **entries("normalized_percent", score),
@@ -138,13 +151,17 @@ def speed_and_lane_changes(episodes: pl.DataFrame) -> Row:
 
 
 def _paired(*drivers: pl.DataFrame, what: pl.Expr = _RETURN) -> list[Array]:
-    """``what`` of each of ``drivers`` on the episodes that all of them drove, in one order, each
-    [E].
+    """``what`` of each of ``drivers`` on the E episodes that all of them drove, in one order.
+
+    A list of doubles [E], one for each driver.
     """
     # Each join leaves the episodes that one more driver has driven, too.
     shared = drivers[0].select(_EPISODE)
     for column, driver in enumerate(drivers):
-        shared = shared.join(driver.select(*_EPISODE, what.alias(str(column))), on=_EPISODE)
+        # Columns are named by the driver's place: two drivers may have one name.
+        values = driver.select(*_EPISODE, what.alias(str(column)))
+        shared = shared.join(values, on=_EPISODE)
+
     # Joins keep no order.
     ordered = shared.sort(_EPISODE)
     return [ordered[str(column)].cast(pl.Float64).to_numpy() for column in range(len(drivers))]
@@ -169,18 +186,23 @@ def verdict(lead: Estimate, differences: Array, one_failed: npt.NDArray[np.bool_
     )
     if not decided:
         return "undecided"
+
     side = "above" if lead.value > 0.0 else "below"
     if not 0 < one_failed.sum() < FEWEST_FAILURES:
         return side
+
+    # The same question without the few episodes in which one failed.
     rest = differences[~one_failed]
-    # Without those episodes there are no few failures left, and so no third look.
-    same = verdict(mean_interval(rest), rest, np.zeros(len(rest), dtype=bool)) == side
-    return side if same else "undecided"
+    # None of those is left, so there is no third look.
+    nobody_failed = np.zeros(len(rest), dtype=bool)
+    side_of_rest = verdict(mean_interval(rest), rest, nobody_failed)
+    return side if side_of_rest == side else "undecided"
 
 
 def paired_rows(episodes: pl.DataFrame) -> list[Row]:
-    """The first driver against each of the others, traffic by traffic; ``episodes`` as for
-    :func:`evaluation_rows`.
+    """The first driver against each of the others, traffic by traffic.
+
+    ``episodes`` as for :func:`evaluation_rows`.
 
     Returns:
         Per traffic and other driver ``agent, over, traffic, episodes`` (driven by both), ``lead``
@@ -196,19 +218,22 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
         others = driven.filter(pl.col("agent") != first)
         for (other,), theirs in others.group_by("agent", maintain_order=True):
             returns = _paired(ours, theirs)
-            failed = _paired(ours, theirs, what=pl.col("reason").is_in(FAILURES))
             if len(returns[0]) < 2:
                 continue
+
+            failed = _paired(ours, theirs, what=pl.col("reason").is_in(FAILURES))
+            one_failed = failed[0] != failed[1]
             lead = paired_difference(*returns)
-            row = {
-                "agent": first,
-                "over": other,
-                "traffic": traffic,
-                "episodes": len(returns[0]),
-                **entries("lead", lead),
-                "verdict": verdict(lead, returns[0] - returns[1], failed[0] != failed[1]),
-            }
-            rows.append(row)
+            rows.append(
+                {
+                    "agent": first,
+                    "over": other,
+                    "traffic": traffic,
+                    "episodes": len(returns[0]),
+                    **entries("lead", lead),
+                    "verdict": verdict(lead, returns[0] - returns[1], one_failed),
+                }
+            )
     return rows
 
 
@@ -225,6 +250,7 @@ def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> tuple[Estimate | N
             needed = f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents"
             return None, f"{needed}; {name} is missing"
         drivers.append(driver)
+
     # Episodes that one of the three did not drive would shift the scale.
     returns = _paired(*drivers)
     if len(returns[0]) < 2:
@@ -234,22 +260,28 @@ def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> tuple[Estimate | N
 
 
 def normalized_percent(
-    agent: npt.ArrayLike, mobil: npt.ArrayLike, random_legal: npt.ArrayLike
+    agent: npt.ArrayLike,
+    mobil: npt.ArrayLike,
+    random_legal: npt.ArrayLike,
 ) -> tuple[Estimate | None, str | None]:
     """The paper's '% of MOBIL': 0 for ``random_legal``, 100 for MOBIL.
 
     It is ``100 (R - R_0) / (R_MOBIL - R_0)``. This form fits both rows of the paper's Table VII; a
-    plain ratio of mean rewards has no meaning where rewards can be negative. Returns [E] of the
-    three drivers are on the same episodes, in the same order. The interval resamples episodes, all
-    drivers together; resamples in which MOBIL's lead over the random driver is exactly 0 are left
-    out.
+    plain ratio of mean rewards has no meaning where rewards can be negative. The interval resamples
+    episodes, all drivers together; resamples in which MOBIL's lead over the random driver is
+    exactly 0 are left out.
+
+    Args:
+        agent, mobil, random_legal: their returns on the same episodes, in the same order, [E].
 
     Returns:
         The score, and None; or None, and the reason why there is no score: the paired interval of
         MOBIL's lead over the random driver includes 0, so the scale would have no length.
     """
     drivers = (agent, mobil, random_legal)
+    # [E, 3], so that a resample draws episodes and not drivers.
     returns = np.stack([np.asarray(values, dtype=np.float64) for values in drivers], axis=1)
+
     # The scale has a length only if MOBIL is better than random driving beyond doubt.
     lead = paired_difference(returns[:, 1], returns[:, 2])
     if lead.interval is None:
@@ -257,10 +289,12 @@ def normalized_percent(
     if not lead.excludes_zero():
         interval = f"{lead.low:.1f} to {lead.high:.1f}"
         return None, f"the interval of mobil's lead over random_legal includes 0 ({interval})"
+
     means = bootstrap_means(returns)
     # A resample without MOBIL's lead would divide by zero.
     with_scale = means[means[:, 1] != means[:, 2]]
     low, high = np.quantile(percent_of_way(*with_scale.T), TAIL_LEVELS)
+
     # The value itself is of all episodes, not of the resamples.
     value = percent_of_way(*returns.mean(axis=0))
     return Estimate(float(value), float(low), float(high)), None
@@ -293,21 +327,23 @@ def crashes_by_scene(episodes: pl.DataFrame, scenes: Sequence[str]) -> tuple[Est
         raise UserError(
             f"{len(scenes)} scenes for {episodes.height} episodes: expected one for each."
         )
+
     with_scene = episodes.with_columns(pl.Series("scene", scenes, pl.String))
-    by_scene = (
-        with_scene.group_by("scene")
-        .agg(
-            episodes=pl.len(),
-            hard_crash=(pl.col("reason") == _CRASH).sum(),
-            distance_km=pl.col("distance_m").cast(pl.Float64).sum() / 1000.0,
-        )
-        .sort("scene")
+    by_scene = with_scene.group_by("scene").agg(
+        episodes=pl.len(),
+        hard_crash=(pl.col("reason") == _CRASH).sum(),
+        distance_km=pl.col("distance_m").cast(pl.Float64).sum() / 1000.0,
     )
+    # Groups come in any order.
+    by_scene = by_scene.sort("scene")
+
     rows = []
     for row in by_scene.to_dicts():
         km = row["distance_km"]
         rate = poisson_interval(row[_CRASH]).scaled(per=km) if km > 0.0 else None
         rows.append({**row, **entries("crashes_per_km", rate)})
+
+    # Crashes and km of each scene.
     crashes = by_scene[_CRASH].to_numpy().astype(np.float64)
     driven = by_scene["distance_km"].to_numpy()
     total = float(driven.sum())
@@ -316,16 +352,18 @@ def crashes_by_scene(episodes: pl.DataFrame, scenes: Sequence[str]) -> tuple[Est
             "crashes per km: nobody drove; give episodes that last at least one decision."
         )
     rate_of_all = float(crashes.sum() / total)
+
     # One scene has no spread to resample.
     if len(driven) < 2:
         return Estimate(rate_of_all), rows
     if crashes.sum() == 0:
         return poisson_interval(0).scaled(per=total), rows
+
     # A resample may hold nothing but scenes in which nobody drove.
     driven = driven.clip(min=np.finfo(np.float64).tiny)
-    ratios = [
-        counts @ crashes / (counts @ driven) for counts in resample_counts(len(driven), RESAMPLES)
-    ]
+    ratios = []
+    for counts in resample_counts(len(driven), RESAMPLES):
+        ratios.append(counts @ crashes / (counts @ driven))
     low, high = np.quantile(np.concatenate(ratios), TAIL_LEVELS)
     return Estimate(rate_of_all, float(low), float(high)), rows
 
@@ -333,10 +371,16 @@ def crashes_by_scene(episodes: pl.DataFrame, scenes: Sequence[str]) -> tuple[Est
 def failed_episodes(episodes: pl.DataFrame) -> list[Row]:
     """Every crash and departure.
 
-    Per ``driver, traffic, seed`` the numbers of the episodes that ended so.
+    ``episodes`` as for :func:`evaluation_rows`.
+
+    Returns:
+        Per ``driver, traffic, seed`` the numbers of the episodes that ended so: lists
+        ``hard_crash`` and ``out_of_road``. Who never failed has no row.
     """
     failed = episodes.filter(pl.col("reason").is_in(FAILURES))
     # A row per driver, traffic and seed, so that an episode can be driven again by its numbers.
     names = (pl.col("agent").alias("driver"), "traffic", "seed")
-    ended = {end: pl.col("episode").filter(pl.col("reason") == end).sort() for end in FAILURES}
+    ended = {}
+    for end in FAILURES:
+        ended[end] = pl.col("episode").filter(pl.col("reason") == end).sort()
     return failed.group_by(*names, maintain_order=True).agg(**ended).to_dicts()

@@ -11,17 +11,21 @@ from typing import Any
 
 from ganlane.evaluation.rows import FEWEST_EPISODES
 
+#: What a line of a table is made of.
 Row = Mapping[str, Any]
 #: Makes a cell of a row.
 Cell = Callable[[Any], str]
 
+#: A cell without anything to say.
 NOTHING = "-"
 
 
 def aligned(lines: Sequence[Sequence[str]], names: int = 1) -> str:
-    """A text table of headings (the first line) and rows, with a ruler between them.
+    """A text table of headings and rows, with a ruler between them.
 
-    The first ``names`` columns are left-aligned, the others right-aligned.
+    Args:
+        lines: cells of the headings, then of each row, all of one length.
+        names: so many columns, from the left, are left-aligned, the others right-aligned.
     """
     # A column is as wide as its widest cell, the heading included.
     widths = [max(map(len, column)) for column in zip(*lines)]
@@ -39,8 +43,10 @@ def aligned(lines: Sequence[Sequence[str]], names: int = 1) -> str:
 def show(*texts: str, columns: str = "auto") -> None:
     """Print texts, a blank line between them.
 
-    Their tables are as wide as the terminal (``columns`` auto) or whole (all). Where the output is
-    no terminal, tables are whole.
+    Args:
+        texts: with tables of :func:`aligned` among their lines.
+        columns: ``auto``: tables are as wide as the terminal, and whole where the output is none;
+            ``all``: they are whole.
     """
     text = "\n\n".join(texts)
     # A file or a pipe gets all columns.
@@ -55,31 +61,43 @@ def fitting(text: str, width: int) -> str:
     A table ends with a blank line; a line below it names what is left out. Columns go from the
     right, those of :data:`_FIRST_TO_GO` before the others.
     """
-    return "\n\n".join(_narrowed(part.split("\n"), width) for part in text.split("\n\n"))
+    parts = text.split("\n\n")
+    return "\n\n".join(_narrowed(part.split("\n"), width) for part in parts)
 
 
 def _narrowed(lines: Sequence[str], width: int) -> str:
-    """One part of a text, as :func:`fitting` does; its lines."""
+    """The part of a text with these ``lines``, made as narrow as :func:`fitting` says."""
     # The ruler below the headings tells a table from other text, and where its columns stand.
     rulers = [place for place, line in enumerate(lines) if re.fullmatch(r"-+(  -+)+", line)]
     if not rulers or len(lines[rulers[0]]) <= width:
         return "\n".join(lines)
-    head = rulers[0] - 1
+
     # Where each column stands in a line, by its heading.
+    head = rulers[0] - 1
     spans: dict[str, slice] = {}
     for ruler in re.finditer("-+", lines[head + 1]):
         span = slice(*ruler.span())
-        spans[lines[head][span].strip()] = span
-    # Columns go one by one until the rest fits; the first, the name, stays.
+        heading = lines[head][span].strip()
+        spans[heading] = span
+
+    # Columns go one by one until the rest fits, the least telling first, then from the right. The
+    # first, the name, stays.
     shown = dict(spans)
     for name in [*_FIRST_TO_GO, *reversed(list(spans)[1:])]:
-        if sum(span.stop - span.start + 2 for span in shown.values()) > width + 2:
+        # Two spaces behind each, but for the last.
+        needed = sum(span.stop - span.start + 2 for span in shown.values()) - 2
+        if needed > width:
             shown.pop(name, None)
+
     # Every line is cut at the same places.
-    rows = ["  ".join(line[span] for span in shown.values()).rstrip() for line in lines[head:]]
+    narrowed = []
+    for line in lines[head:]:
+        cells = [line[span] for span in shown.values()]
+        narrowed.append("  ".join(cells).rstrip())
+
     # In the order of the table, so that a reader knows where they would be.
     hidden = ", ".join(name for name in spans if name not in shown)
-    return "\n".join([*lines[:head], *rows, f"(columns=all shows: {hidden})"])
+    return "\n".join([*lines[:head], *narrowed, f"(columns=all shows: {hidden})"])
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -88,7 +106,13 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def with_interval(row: Row, key: str, digits: int = 3) -> str:
-    """A cell with ``row[key]``, and ``[low, high]`` where the row has its interval, ``key_ci``."""
+    """A cell with a number, and ``[low, high]`` where the row has its interval.
+
+    Args:
+        row: holds the number as ``key`` and its interval as ``key_ci``; either may be missing.
+        key: the number's.
+        digits: behind the point.
+    """
     text = number(row.get(key), digits)
     interval = row.get(f"{key}_ci")
     if not interval:
@@ -99,7 +123,8 @@ def with_interval(row: Row, key: str, digits: int = 3) -> str:
 
 def with_sign(row: Row, key: str, digits: int) -> str:
     """:func:`with_interval` of a difference: ``+`` before what is not negative."""
-    return ("" if row[key] < 0.0 else "+") + with_interval(row, key, digits)
+    sign = "" if row[key] < 0.0 else "+"
+    return sign + with_interval(row, key, digits)
 
 
 def text_of(key: str) -> Cell:
@@ -114,10 +139,15 @@ def number_of(key: str, digits: int) -> Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """A title, headings, lines of cells, and notes.
+    """A table of cells that are texts already.
 
-    The first ``names`` columns hold words and are set to the left, the others hold numbers and are
-    set to the right.
+    Attributes:
+        title: stands above; empty for none.
+        headings: of the columns.
+        lines: the cells of each line, as many as headings.
+        names: so many columns, from the left, hold words and are set to the left; the others hold
+            numbers and are set to the right.
+        notes: lines below.
     """
 
     title: str
@@ -136,16 +166,22 @@ class Table:
         notes: Sequence[str] = (),
         optional: Sequence[str] = (),
     ) -> Table:
-        """One line per row; ``columns`` maps each heading to the maker of its cells.
+        """A table with one line per row.
 
-        Those of ``optional`` are left out where no row has anything in them.
+        Args:
+            title: stands above; empty for none.
+            rows: what the cells are made of.
+            columns: by heading, what makes a cell of a row.
+            names: so many columns hold words.
+            notes: lines below.
+            optional: headings of columns that are left out where no row has anything in them.
         """
-        # Columns that say nothing here make room for those that do.
-        shown = {
-            heading: cell
-            for heading, cell in columns.items()
-            if heading not in optional or any(cell(row) not in ("0", NOTHING) for row in rows)
-        }
+        # Columns that say nothing here make room for those that do; a count of 0 says nothing.
+        shown = {}
+        for heading, cell in columns.items():
+            if heading not in optional or any(cell(row) not in ("0", NOTHING) for row in rows):
+                shown[heading] = cell
+
         lines = [[cell(row) for cell in shown.values()] for row in rows]
         return cls(title, list(shown), lines, names, notes)
 
@@ -160,7 +196,7 @@ class Table:
 
 
 #: Columns of an evaluation, names before numbers; ``run``: of a sweep.
-_COLUMNS: Mapping[str, Cell] = {
+_COLUMNS = {
     "run": text_of("run"),
     "agent": text_of("agent"),
     "traffic": text_of("traffic"),
@@ -198,9 +234,10 @@ _FIRST_TO_GO = (
 
 
 def text_table(rows: Sequence[Row]) -> str:
-    """The rows of :func:`ganlane.evaluation.evaluation_rows`.
+    """The rows of :func:`ganlane.evaluation.evaluation_rows`, also those of a sweep.
 
-    Below them stands a line for each reason why a score is missing.
+    Below them stands a line for each reason why a score is missing, with the traffics on which it
+    holds.
     """
     # Each reason with its traffics, once each.
     reasons: dict[str, list[str]] = {}
@@ -209,29 +246,28 @@ def text_table(rows: Sequence[Row]) -> str:
         traffic = row.get("traffic")
         if reason is not None and traffic not in reasons.setdefault(reason, []):
             reasons[reason].append(str(traffic))
-    notes = [
-        f"% of MOBIL on {', '.join(traffics)}: none, {reason}"
-        for reason, traffics in reasons.items()
-    ]
-    return Table.of(
-        "",
-        rows,
-        _COLUMNS,
-        names=2 + any("run" in row for row in rows),
-        notes=notes,
-        optional=_OPTIONAL,
-    ).text()
+
+    notes = []
+    for reason, traffics in reasons.items():
+        notes.append(f"% of MOBIL on {', '.join(traffics)}: none, {reason}")
+
+    # Agent and traffic are words, and the run where there is one.
+    names = 2 + any("run" in row for row in rows)
+    return Table.of("", rows, _COLUMNS, names, notes, _OPTIONAL).text()
 
 
 def paired_table(rows: Sequence[Row]) -> str:
-    """The rows of :func:`ganlane.evaluation.paired_rows`, each lead with its sign."""
+    """The rows of :func:`ganlane.evaluation.paired_rows`, each lead with its sign.
 
-    columns: Mapping[str, Cell] = {
+    A note says why there is no verdict where episodes are few.
+    """
+    columns = {
         "paired lead": lambda row: f"{row['agent']} over {row['over']}",
         "traffic": text_of("traffic"),
         "reward [95 %]": lambda row: with_sign(row, "lead", 1),
         "verdict": text_of("verdict"),
     }
+
     few = any(row["episodes"] < FEWEST_EPISODES for row in rows)
     notes = [f"no verdict below {FEWEST_EPISODES} episodes"] if few else []
     return Table.of("", rows, columns, 2, notes).text()

@@ -28,11 +28,19 @@ from ganlane.sim.spawn import TABLE_II, RandomScenes, SpawnParameters
 from ganlane.sim.state import Road, Vehicles, lateral_half_extent
 from ganlane.traffic import TrafficModule
 
-#: Times at which speeds are summarised, s, by name; and the distance of the goal, m.
-SPEEDS_AT_S = {"10 s": 10.0, "60 s": 60.0, "150 s": 150.0, "300 s": 300.0}
-GOAL, GOAL_M = "5000 m", 5000.0
+#: Times at which speeds are summarised, s, by name.
+SPEEDS_AT_S = {
+    "10 s": 10.0,
+    "60 s": 60.0,
+    "150 s": 150.0,
+    "300 s": 300.0,
+}
+#: The goal by its name, and its distance, m.
+GOAL = "5000 m"
+GOAL_M = 5000.0
 #: Samples of one batch (times, rows, vehicles); bounds the memory.
 _MOST_SAMPLES = 12_000_000
+#: Episodes of one batch.
 _MOST_ROWS = 64
 #: A body further beyond the edge than this is off the road, m; less is rounding.
 EDGE_M: Final = 0.01
@@ -51,6 +59,7 @@ class LongRunParameters:
         vehicle_km: at least so many are driven.
         most_s: no episode lasts longer, s; it ends when its vehicles have covered 5000 m on average
             and 5 minutes have passed.
+        seed: of the random numbers.
         spawn: Table II; the spread grows with the vehicles at the paper's density.
     """
 
@@ -62,9 +71,12 @@ class LongRunParameters:
 
 
 class Trajectories(NamedTuple):
-    """Vehicles of a batch without ego.
+    """Vehicles of a batch without ego, from the start on, 0.1 s apart.
 
-    Positions [T, N, M] in m, speeds [T, N, M] in m/s, sizes [N, M] in m.
+    Attributes:
+        x, y: positions of the centres, m, [T, N, M].
+        speed: m/s, [T, N, M].
+        length, width: of the bodies, m, [N, M].
     """
 
     x: np.ndarray
@@ -85,26 +97,40 @@ class EventCounter:
 
     def __init__(self, road: Road) -> None:
         self.road = road
-        self.overlaps = self.off_road = self.standstills = 0
+        self.overlaps = 0
+        self.off_road = 0
+        self.standstills = 0
         #: The last state; empty where a new batch of episodes begins.
         self.before: dict[str, Tensor] = {}
 
     def count(self, vehicles: Vehicles, step: int) -> None:
-        """Count the events of a physics step."""
+        """Count the events of a physics step.
+
+        Args:
+            vehicles: [N, M + 1] after the step, the ego's empty place first.
+            step: its number since the episodes began.
+        """
         # Everything is counted without the ego's empty place.
         others = vehicles.columns(slice(1, None))
-        self.overlaps += self._onsets("overlap", pair_overlaps(others).triu(1))
+
+        # Above the diagonal, so that a pair counts once.
+        pairs = pair_overlaps(others).triu(1)
+        self.overlaps += self._onsets("overlap", pairs)
+
         # Half the width of a body, turned with its heading.
         half = lateral_half_extent(others) - EDGE_M
         left = self.road.left_edge_m()
         right = self.road.right_edge_m()
         outside = (others.y + half > left) | (others.y - half < right)
         self.off_road += self._onsets("off_road", outside & others.valid)
-        if step % 10 == 9:  # once a second
+
+        # Standstills last, and to look for leaders is dear: once a second is enough.
+        if step % 10 == 9:
             slow = (vehicles.speed < STANDING_MPS) & vehicles.valid
             # Standing behind somebody is queueing, no standstill.
             ahead = leader(perceive(vehicles, self.road), self.road.lane_of(vehicles.y))
             free = ahead.gap > FREE_M
+            # Leaders are looked for among all, so only here the ego's place goes.
             self.standstills += self._onsets("standstill", (slow & free)[:, 1:])
 
     def _onsets(self, name: str, now: Tensor) -> int:
@@ -121,14 +147,25 @@ def long_run(
     parameters: LongRunParameters,
     name: str = "traffic",
 ) -> dict[str, Any]:
-    """Drive ``parameters.vehicle_km``: counts, rates, speeds over time and quantiles.
+    """Drive ``parameters.vehicle_km``, batch after batch.
 
-    Rates are per vehicle-km with exact 95 % intervals, None where no vehicle moved. Progress is
-    printed under the traffic's ``name``.
+    Args:
+        make: makes the traffic.
+        road: on which it drives.
+        parameters: vehicles, length and seed.
+        name: of the traffic, under which the progress is printed.
+
+    Returns:
+        ``vehicles``, ``episodes`` and ``vehicle_km`` that were driven; the counts ``lane_changes``,
+        ``overlaps``, ``off_road`` and ``standstills_in_free_flow``, and what :func:`rates` makes of
+        the first two; ``lane_change_duration_mean_s`` of the complete changes (None without any);
+        ``acceleration_quantiles``, m/s2, by level as text; and ``speeds``, :func:`mean_speeds` by
+        the names of :data:`SPEEDS_AT_S` and :data:`GOAL`.
     """
     traffic = make(road)
     events = EventCounter(road)
-    batches: list[dict[str, np.ndarray]] = []
+
+    batches = []
     km = 0.0
     episodes = 0
     moving = True
@@ -137,7 +174,10 @@ def long_run(
         rows = _rows(parameters, parameters.vehicle_km - km)
         driven = drive_spawned(traffic, parameters, episodes, rows, events)
         batches.append(batch_samples(driven, road))
-        batch_km = float((driven.x[-1] - driven.x[0]).sum(dtype=np.float64)) / 1000.0
+
+        # In double precision: thousands of distances are added up.
+        way_m = driven.x[-1] - driven.x[0]
+        batch_km = float(way_m.sum(dtype=np.float64)) / 1000.0
         moving = batch_km > 0.0
         km += batch_km
         episodes += rows
@@ -145,12 +185,23 @@ def long_run(
             f"{name}, long run of {parameters.vehicles} vehicles: {km:.0f} of "
             f"{parameters.vehicle_km:g} vehicle-km"
         )
-    samples = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
+
+    # The samples of all batches, by name.
+    samples = {}
+    for kind in batches[0]:
+        samples[kind] = np.concatenate([batch[kind] for batch in batches])
+
+    # A change that was cut off by the end of an episode counts, but has no duration.
     changes = len(samples["duration"])
     durations = samples["duration"][samples["complete"]]
+    quantiles = {}
+    for level in (0.05, 0.95):
+        quantiles[f"{level:g}"] = float(np.quantile(samples["acceleration"], level))
+
     # From the episodes that lasted so long, or came so far.
     speeds = {time: mean_speeds(samples[time]) for time in SPEEDS_AT_S}
     speeds[GOAL] = mean_speeds(samples[GOAL], after_s=samples["after_s"])
+
     return {
         "vehicles": parameters.vehicles,
         "episodes": episodes,
@@ -161,10 +212,7 @@ def long_run(
         **rates(changes, events.overlaps, km),
         "off_road": events.off_road,
         "standstills_in_free_flow": events.standstills,
-        "acceleration_quantiles": {
-            f"{level:g}": float(np.quantile(samples["acceleration"], level))
-            for level in (0.05, 0.95)
-        },
+        "acceleration_quantiles": quantiles,
         "speeds": speeds,
     }
 
@@ -175,23 +223,29 @@ def _rows(parameters: LongRunParameters, km: float) -> int:
     Each vehicle is taken to cover a little less than 5000 m.
     """
     # 14 m/s is a slow traffic's mean speed: rather too many than too few.
-    expected = parameters.vehicles * min(4.8, 0.014 * parameters.most_s)
+    expected_km = parameters.vehicles * min(4.8, 0.014 * parameters.most_s)
+
+    # As many samples as the memory holds.
     steps = round(parameters.most_s / PHYSICS_STEP_S)
     most = min(_MOST_ROWS, _MOST_SAMPLES // (steps * parameters.vehicles))
+
     # Not more rows than the remaining kilometres ask for.
-    return max(1, min(math.ceil(km / expected), most))
+    return max(1, min(math.ceil(km / expected_km), most))
 
 
 def spawned_vehicles(
-    traffic: TrafficModule, parameters: LongRunParameters, key: Tensor
+    traffic: TrafficModule,
+    parameters: LongRunParameters,
+    key: Tensor,
 ) -> Vehicles:
     """The vehicles [N, M + 1] at the start of the episodes ``key`` [N].
 
     Index 0, an ego's, is not valid.
     """
     # Table II's density, for the vehicles and an empty place for the ego.
-    spread = parameters.spawn.spread_m * (parameters.vehicles + 1) / 9.0
-    start = replace(parameters.spawn, spread_m=max(parameters.spawn.spread_m, spread))
+    spread_m = parameters.spawn.spread_m * (parameters.vehicles + 1) / 9.0
+    # Fewer vehicles keep Table II's spread.
+    start = replace(parameters.spawn, spread_m=max(parameters.spawn.spread_m, spread_m))
     scenes = RandomScenes(
         traffic.road,
         parameters.vehicles + 1,
@@ -199,6 +253,7 @@ def spawned_vehicles(
         others_visibility=int(traffic.visibility),
     )
     vehicles = scenes(key, torch.float32)
+
     # Spawned with an ego, since Table II has one, and driven without it.
     index = torch.arange(parameters.vehicles + 1)
     return vehicles.with_(valid=vehicles.valid & (index > 0))
@@ -211,57 +266,86 @@ def drive_spawned(
     rows: int,
     events: EventCounter,
 ) -> Trajectories:
-    """One batch of ``rows`` spawned episodes from number ``first`` on; ``events`` counts."""
+    """Drive one batch of spawned episodes.
+
+    It ends when the vehicles of every episode have covered 5000 m on average and 5 minutes have
+    passed, or after ``parameters.most_s``.
+
+    Args:
+        traffic: of one road.
+        parameters: vehicles, length and seed.
+        first: number of the first episode.
+        rows: episodes side by side.
+        events: counts what happens.
+    """
+    # Numbers go on from batch to batch, so that no episode is driven twice.
     counters = {
         keys.SEED: torch.full((rows,), parameters.seed),
         keys.EPISODE: first + torch.arange(rows),
     }
-    # Numbers go on from batch to batch, so that no episode is driven twice.
     key = episode_key(traffic.stream, *counters.values())
     state = spawned_vehicles(traffic, parameters, key)
     _, memory = traffic.enter(state, key, counters[keys.EPISODE])
-    course = [(state.x, state.y, state.speed)]
     start = state.x
+    course = [(state.x, state.y, state.speed)]
+
     # Onsets do not carry over from the batch before.
     events.before.clear()
     for step in range(round(parameters.most_s / PHYSICS_STEP_S)):
         state, memory = step_traffic(traffic, state, memory, counters, step)
         events.count(state, step)
         course.append((state.x, state.y, state.speed))
+
         # Distances are tested once in ten seconds of driving: cheap, and exact enough.
         due = step % 100 == 99 and step * PHYSICS_STEP_S >= max(SPEEDS_AT_S.values())
         if due and bool(((state.x - start)[:, 1:].mean(1) >= GOAL_M).all()):
             break
+
+    # Without the ego's empty place.
     x, y, speed = (torch.stack(values)[..., 1:].numpy() for values in zip(*course))
-    return Trajectories(x, y, speed, state.length[:, 1:].numpy(), state.width[:, 1:].numpy())
+    length = state.length[:, 1:].numpy()
+    width = state.width[:, 1:].numpy()
+    return Trajectories(x, y, speed, length, width)
 
 
 def batch_samples(trajectories: Trajectories, road: Road) -> dict[str, np.ndarray]:
-    """Samples of one batch.
+    """Samples of one batch, driven on ``road``.
 
-    Of every lane change its ``duration`` in s and whether it is ``complete``; ``acceleration``,
-    m/s2; speeds [R, K] of the R episodes that lasted so long (:data:`SPEEDS_AT_S`) or came so far
-    (:data:`GOAL`), m/s, and when the latter came there, ``after_s``.
+    Returns:
+        Of every lane change its ``duration`` in s and whether it is ``complete``;
+        ``acceleration``, m/s2; speeds [R, K] of the R episodes that lasted so long
+        (:data:`SPEEDS_AT_S`) or came so far (:data:`GOAL`), m/s, and when the latter came there,
+        ``after_s``.
     """
     # Every vehicle of every episode is a track of its own, present all the time.
     y = trajectories.y.reshape(len(trajectories.y), -1).astype(np.float64)
+    # One track behind the other: each begins after as many samples as there are times.
     begins = np.arange(y.size) % len(y) == 0
     widths = np.full(y.size, float(road.lane_width_m))
-    changes = find_lane_changes(Tracks(y.T.ravel(), widths, begins))
+    tracks = Tracks(y.T.ravel(), widths, begins)
+    changes = find_lane_changes(tracks)
+
     second = round(1.0 / PHYSICS_STEP_S)
     x = trajectories.x.astype(np.float64)
     # The same filter as for recordings; one sample a second is enough.
-    bend = x[2 * second :: second] - 2.0 * x[second:-second:second] + x[: -2 * second : second]
+    before = x[: -2 * second : second]
+    middle = x[second:-second:second]
+    after = x[2 * second :: second]
+    bend = after - 2.0 * middle + before
+
     speeds = {}
     for name, seconds in SPEEDS_AT_S.items():
         time = round(seconds / PHYSICS_STEP_S)
         # An episode that ended earlier says nothing about this time.
         lasted = trajectories.speed[time : time + 1]
+        # [1, N, M] or [0, N, M] to [N, M] or [0, M].
         speeds[name] = lasted.reshape(-1, lasted.shape[-1])
+
     # The first time at which the episode's vehicles have covered 5000 m on average, [T, N].
     there = (trajectories.x - trajectories.x[:1]).mean(-1) >= GOAL_M
     arrived = np.flatnonzero(there.any(0))
     times = there.argmax(0)[arrived]
+
     return {
         "duration": changes.duration_s,
         "complete": changes.complete,
@@ -273,16 +357,28 @@ def batch_samples(trajectories: Trajectories, road: Road) -> dict[str, np.ndarra
 
 
 def mean_speeds(speed: np.ndarray, **others: np.ndarray) -> dict[str, float | int | None]:
-    """Means over R episodes of the mean and the standard deviation of their speeds [R, K], m/s.
+    """Means over episodes of the mean and the standard deviation of their vehicles' speeds.
 
-    Those of the ``others`` [R] too, and R; None without any.
+    Args:
+        speed: of K vehicles in R episodes, m/s, [R, K].
+        others: what else is averaged over the episodes, [R], by name.
+
+    Returns:
+        ``mean_speed_mps``, ``spread_mps`` and the ``others``, None without episodes; ``episodes``
+        is R.
     """
     speed = speed.astype(np.float64)
+    # A single vehicle has no spread.
     spread = speed.std(-1, ddof=1) if speed.shape[-1] > 1 else np.zeros(len(speed))
-    of_episodes = {"mean_speed_mps": speed.mean(-1), "spread_mps": spread, **others}
-    means = {
-        name: float(values.mean()) if len(values) else None for name, values in of_episodes.items()
+    of_episodes = {
+        "mean_speed_mps": speed.mean(-1),
+        "spread_mps": spread,
+        **others,
     }
+
+    means = {}
+    for name, values in of_episodes.items():
+        means[name] = float(values.mean()) if len(values) else None
     return {**means, "episodes": len(speed)}
 
 

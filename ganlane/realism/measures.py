@@ -43,17 +43,20 @@ from ganlane.files import (
 #: recording.
 SHIPPED_REFERENCE = CHECKPOINTS / "realism_us101.json"
 _KIND = "ganlane realism reference"
+#: Of the bootstrap over units.
 RESAMPLES = 2_000
 #: Random halves of the recordings that the ceiling is the mean of.
 SPLITS = 200
+#: Stands in for 0 where a logarithm or a quotient would be infinite.
 _TINY = 1e-300
 #: A vehicle's first seconds do not count.
 SETTLING_S: Final = 3.0
 #: Half of the second that speeds are taken over, and all of it, in frames.
 _HALF = 5
 _WHOLE = 10
-#: Leaders further ahead are ignored, m; slower than this a driver shows no headway, m/s.
+#: Leaders further ahead are ignored, m.
 FOLLOWING_M: Final = 100.0
+#: Slower than this a driver shows no headway, m/s.
 SLOWEST_FOLLOWER_MPS: Final = 2.0
 #: Closing in slower than this, a driver approaches nobody, m/s.
 CLOSING_MPS: Final = 0.1
@@ -81,7 +84,7 @@ class Quantity:
         return np.linspace(self.low, self.high, self.bins + 1)
 
 
-#: By name.
+#: What is measured, by name.
 QUANTITIES: Final = {
     "speed": Quantity("m/s", 0.0, 40.0, 40),
     "speed_spread": Quantity("m/s", 0.0, 10.0, 20),
@@ -101,49 +104,74 @@ def jensen_shannon(first: Array, second: Array) -> Array:
     where either histogram is empty. scipy's ``jensenshannon`` is NaN where rounding makes the
     divergence of equal histograms negative.
     """
+    # Counts to shares; an empty histogram gives NaN.
     with np.errstate(invalid="ignore", divide="ignore"):
         p = first / first.sum(-1, keepdims=True)
         q = second / second.sum(-1, keepdims=True)
+
     # 0 log 0 is 0: tiny numbers stand in for empty bins.
     log_middle = np.log2(np.maximum(0.5 * (p + q), _TINY))
 
     def information(share: Array) -> Array:
-        return np.sum(share * (np.log2(np.maximum(share, _TINY)) - log_middle), axis=-1)
+        """Kullback-Leibler divergence of ``share`` from the middle, bits."""
+        log_share = np.log2(np.maximum(share, _TINY))
+        return np.sum(share * (log_share - log_middle), axis=-1)
 
-    return np.sqrt(np.clip(0.5 * (information(p) + information(q)), 0.0, 1.0))
+    divergence = 0.5 * (information(p) + information(q))
+    # Rounding may lead a little out of the range.
+    return np.sqrt(np.clip(divergence, 0.0, 1.0))
 
 
 def pooled_distance(simulated: Array, recorded: Array) -> float:
-    """Distance of two sets of histograms [units, bins], each added up over its units."""
+    """Distance of two sets of histograms [units, bins], each added up over its units.
+
+    NaN where either has no samples.
+    """
     return float(jensen_shannon(simulated.sum(0), recorded.sum(0)))
 
 
 def distance(
-    simulated: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES
+    simulated: Array,
+    recorded: Array,
+    paired: bool = True,
+    resamples: int = RESAMPLES,
 ) -> Estimate:
-    """Distance with its 95 % bootstrap interval over units; both are [units, bins].
+    """Distance with its 95 % bootstrap interval over units.
 
     A resample holds some units twice and others not at all, so its distance is biased upwards; near
     0 all of them lie above the estimate. Hence the basic (reverse percentile) interval, taken of
     the squared distance, in which that bias adds up, cut off at 0 and widened to hold the estimate.
     Percentile and BCa intervals consist of resamples, none of which is 0, so they miss a perfect
-    model's distance. One unit gives no interval.
+    model's distance.
 
-    ``paired`` units are the same and are resampled together; else ``simulated`` alone is.
+    Args:
+        simulated, recorded: counts, [units, bins].
+        paired: the units of both are the same, and are resampled together; else ``simulated``
+            alone is.
+        resamples: of the bootstrap.
+
+    Returns:
+        One unit gives no interval; NaN where either has no samples.
     """
     # Units are pooled: a scene has too few samples of its own for a histogram.
     value = pooled_distance(simulated, recorded)
     (drawn,) = _resampled([simulated], recorded, paired, resamples)
     if not np.isfinite(value) or len(drawn) < 2:
         return Estimate(value)
-    # Both tails are reflected about the estimate.
+
+    # Both tails of the squared distance are reflected about the estimate.
     tails = np.quantile(drawn**2, TAIL_LEVELS)
-    low, high = np.sqrt(np.maximum(2.0 * value**2 - tails[::-1], 0.0))
+    reflected = 2.0 * value**2 - tails[::-1]
+    low, high = np.sqrt(np.maximum(reflected, 0.0))
     return Estimate(value, min(value, float(low)), min(1.0, max(value, float(high))))
 
 
 def distance_difference(
-    first: Array, second: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES
+    first: Array,
+    second: Array,
+    recorded: Array,
+    paired: bool = True,
+    resamples: int = RESAMPLES,
 ) -> Estimate:
     """Distance of ``first`` less that of ``second`` to ``recorded``, with its 95 % interval.
 
@@ -152,32 +180,47 @@ def distance_difference(
     both mostly cancels, divided by the sum of the distances: (a^2 - b^2) / (a + b) = a - b. With
     four units the basic and the percentile interval find one of two equally good models closer too
     often.
+
+    Args:
+        first, second, recorded: counts, [units, bins].
+        paired, resamples: as in :func:`distance`.
     """
     one = pooled_distance(first, recorded)
     other = pooled_distance(second, recorded)
-    ours, theirs = _resampled([first, second], recorded, paired, resamples)
-    units = len(first)
     value = one - other
+    ours, theirs = _resampled([first, second], recorded, paired, resamples)
     if not np.isfinite(value) or len(ours) < 2:
         return Estimate(value)
+
     # S resampled units have (S - 1) / S of the variance that they should have.
+    units = len(first)
     error = float((ours**2 - theirs**2).std()) * np.sqrt(units / (units - 1))
-    reach = float(stdtrit(units - 1, TAIL_LEVELS[1])) * error / max(one + other, _TINY)
+    # From squared distances to distances: two equal models at 0 would divide by zero.
+    quantile = float(stdtrit(units - 1, TAIL_LEVELS[1]))
+    reach = quantile * error / max(one + other, _TINY)
     return Estimate(value, max(-1.0, value - reach), min(1.0, value + reach))
 
 
 def _resampled(models: Sequence[Array], recorded: Array, paired: bool, resamples: int) -> Array:
-    """Distances [models, R] from the R resamples of the units in which all of them are known.
+    """Bootstrapped distances of several models to the recordings.
 
-    None of a single unit.
+    Args:
+        models, recorded: counts, [units, bins] each.
+        paired: resample the units of all together; else those of the models alone.
+        resamples: how many are drawn.
+
+    Returns:
+        [models, R], of the R resamples in which all distances are known; R is 0 for a single unit.
     """
     units = len(recorded) if paired else len(models[0])
     if units < 2:
         return np.empty((len(models), 0))
+
     # The same resamples for all models, so that differences are paired.
     counts = np.concatenate(list(resample_counts(units, resamples)))
     against = counts @ recorded if paired else recorded.sum(0)
     distances = np.stack([jensen_shannon(counts @ model, against) for model in models])
+
     # A resample of units without samples has no distance.
     return distances[:, np.isfinite(distances).all(0)]
 
@@ -186,18 +229,25 @@ def ceiling(recorded: Array) -> float | None:
     """Mean distance of one half of the units [units, bins] to the other, over random halves.
 
     What no model can be expected to beat: halves hold half of the driving, so it errs on the high
-    side. None for one unit.
+    side.
+
+    Returns:
+        None for one unit, and where no half has samples.
     """
     units = len(recorded)
     if units < 2:
         return None
-    generator = np.random.default_rng(0)
+
     # A row is a split: 1 for the units of its first half.
+    generator = np.random.default_rng(0)
     half = np.zeros((SPLITS, units))
     for row in half:
-        row[generator.permutation(units)[: units // 2]] = 1.0
+        first_half = generator.permutation(units)[: units // 2]
+        row[first_half] = 1.0
+
     # All splits at once: [splits, units] times [units, bins].
     values = jensen_shannon(half @ recorded, (1.0 - half) @ recorded)
+    # A half without samples has no distance.
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else None
 
@@ -209,7 +259,8 @@ class Measured:
     Attributes:
         counts: by quantity, samples per unit and bin, [units, bins].
         quantiles: by quantity, by level as text; None without samples.
-        lane_changes, vehicle_km: of all units, from 3 s after each vehicle's first frame.
+        lane_changes: of all units, from 3 s after each vehicle's first frame.
+        vehicle_km: driven meanwhile.
     """
 
     counts: Mapping[str, Array]
@@ -218,23 +269,33 @@ class Measured:
     vehicle_km: float
 
     def summary(self) -> dict[str, Any]:
-        """Lane changes per vehicle-km (:func:`lane_change_rate`) and the ``quantiles``."""
+        """Lane changes per vehicle-km (:func:`lane_change_rate`) and the ``quantiles``.
+
+        What ``results.json`` holds of it, beside the distances.
+        """
         return {
             **lane_change_rate(self.lane_changes, self.vehicle_km),
             "quantiles": self.quantiles,
         }
 
     def restricted_to(self, rows: Sequence[int]) -> Measured:
-        """The same with the counts of some units only; the rest remains that of all."""
-        return replace(self, counts={name: counts[rows] for name, counts in self.counts.items()})
+        """The same with the counts of some units only; the rest remains that of all.
+
+        ``rows`` are the places of the units in the counts.
+        """
+        restricted = {name: counts[rows] for name, counts in self.counts.items()}
+        return replace(self, counts=restricted)
 
 
 def rate_entries(name: str, events: int, km: float, per_km: float = 1.0) -> dict[str, Any]:
     """``events`` per ``per_km`` vehicle-km with their exact 95 % interval, by :func:`entries`.
 
-    None where no vehicle moved.
+    ``km`` were driven; None where no vehicle moved.
     """
-    return entries(name, poisson_interval(events).scaled(per_km, per=km) if km > 0.0 else None)
+    rate = None
+    if km > 0.0:
+        rate = poisson_interval(events).scaled(per_km, per=km)
+    return entries(name, rate)
 
 
 def lane_change_rate(changes: int, km: float) -> dict[str, Any]:
@@ -249,37 +310,56 @@ def lane_change_rate(changes: int, km: float) -> dict[str, Any]:
 def measure(recordings: Sequence[Recording], units: Sequence[str] | None = None) -> Measured:
     """Measure recordings, or what was driven from them.
 
-    ``units``: those of the counts, in this order; by default those of the ``recordings``.
+    Args:
+        recordings: at least one.
+        units: those of the counts, in this order; by default those of the ``recordings``.
     """
     units = units or units_of(recordings)
-    motion = with_motion(pl.concat([recording.frame() for recording in recordings]))
-    # Samples are dropped once they are counted.
+    frames = pl.concat([recording.frame() for recording in recordings])
+    motion = with_motion(frames)
     samples = samples_of(motion)
+
     counts = {}
     quantiles = {}
     for name, table in samples.items():
         counts[name] = _histograms(table, units, QUANTITIES[name])
         column = table["value"]
         quantiles[name] = {f"{level:g}": column.quantile(level, "linear") for level in LEVELS}
+
     # In the order of the units, so that the sum is the same in every run.
     by_unit = motion.filter("counts").group_by("unit", maintain_order=True)
     km = by_unit.agg(km=pl.col("stride").sum() / 1000.0)["km"].to_list()
-    return Measured(counts, quantiles, samples["lane_change_duration"].height, sum(km))
+    changes = samples["lane_change_duration"].height
+    return Measured(counts, quantiles, changes, sum(km))
 
 
 def samples_of(motion: pl.DataFrame) -> dict[str, pl.DataFrame]:
-    """By quantity, columns ``unit`` and ``value``, of a frame :func:`with_motion`."""
+    """The samples of every quantity.
+
+    Args:
+        motion: a frame :func:`with_motion`.
+
+    Returns:
+        By quantity, a row per sample: columns ``unit`` and ``value``, the latter in the unit of
+        :data:`QUANTITIES`.
+    """
     # Only rows that are driven and old enough.
     counted = motion.filter("counts")
-    # Leaders are also those that do not count themselves.
+
+    # Leaders are looked for among all: one that does not count itself is still followed.
     near = pl.col("counts") & pl.col("gap").is_between(0.0, FOLLOWING_M)
     followers = leader_gaps(motion).filter(near).drop_nulls(["speed", "leader_speed"])
-    closing = pl.col("speed") - pl.col("leader_speed")
-    # Two vehicles have hardly a spread.
-    frames = counted.drop_nulls("speed").group_by("unit", "scene", "frame")
-    crowded = frames.agg(pl.col("speed").std(), pl.len()).filter(pl.col("len") >= FEWEST_IN_FRAME)
     # Near standstill the headway grows without bound.
     fast_enough = followers.filter(pl.col("speed") >= SLOWEST_FOLLOWER_MPS)
+    closing = pl.col("speed") - pl.col("leader_speed")
+    approaching = followers.filter(closing > CLOSING_MPS)
+
+    # The spread of a frame stands in the place of the speed; two vehicles have hardly one.
+    frames = counted.drop_nulls("speed").group_by("unit", "scene", "frame")
+    spreads = frames.agg(pl.col("speed").std(), pl.len())
+    crowded = spreads.filter(pl.col("len") >= FEWEST_IN_FRAME)
+
+    # By quantity, the rows that show it, and what it is of their columns.
     values = {
         "speed": (counted, pl.col("speed")),
         "speed_spread": (crowded, pl.col("speed")),
@@ -287,12 +367,14 @@ def samples_of(motion: pl.DataFrame) -> dict[str, pl.DataFrame]:
         "jerk": (counted, pl.col("jerk")),
         "time_headway": (fast_enough, pl.col("gap") / pl.col("speed")),
         "gap": (followers, pl.col("gap")),
-        "time_to_collision": (followers.filter(closing > CLOSING_MPS), pl.col("gap") / closing),
+        "time_to_collision": (approaching, pl.col("gap") / closing),
     }
-    samples = {
-        name: rows.select("unit", value=value).drop_nulls().filter(pl.col("value").is_finite())
-        for name, (rows, value) in values.items()
-    }
+    samples = {}
+    for name, (rows, value) in values.items():
+        chosen = rows.select("unit", value=value)
+        # The ends of a track have no centred differences.
+        samples[name] = chosen.drop_nulls().filter(pl.col("value").is_finite())
+
     # Changes count that cross in a row that counts, censored ones as far as seen: simulations run
     # where and as long as the recordings do, so both are cut off alike.
     widths = dict(motion.select("scene", "lane_width").unique().iter_rows())
@@ -303,37 +385,50 @@ def samples_of(motion: pl.DataFrame) -> dict[str, pl.DataFrame]:
 
 
 def _histograms(table: pl.DataFrame, units: Sequence[str], quantity: Quantity) -> Array:
-    """Samples per unit and bin, [units, bins]."""
-    # Row and column of each sample in the table of counts.
+    """Samples per unit and bin, [units, bins].
+
+    ``table`` has a row per sample, with its ``unit``, one of ``units``, and its ``value``.
+    """
+    # A row per unit, in their order.
     row = table["unit"].cast(pl.Enum(units)).to_physical().to_numpy()
+
+    # A column per bin; values beyond go into the outermost ones.
     share = (table["value"].to_numpy() - quantity.low) / (quantity.high - quantity.low)
     column = np.clip(np.floor(share * quantity.bins), 0, quantity.bins - 1).astype(np.int64)
+
+    # One after the other, since many samples fall into one bin.
     counts = np.zeros((len(units), quantity.bins))
     np.add.at(counts, (row, column), 1.0)
     return counts
 
 
 def with_motion(frame: pl.DataFrame) -> pl.DataFrame:
-    """``frame`` with speed, acceleration and jerk over 1 s, and what counts.
+    """``frame`` with what it says of motion, and what counts.
 
-    ``stride`` is the step driven, m; ``counts`` is whether the row is measured.
+    Returns:
+        Further columns: ``speed``, m/s, ``acceleration``, m/s2, and ``jerk``, m/s3, from positions
+        one second apart (null at the ends of a track); ``stride``, the step driven, m; ``counts``,
+        whether the row is measured.
     """
 
     def x_at(frames: int) -> pl.Expr:
         """The position ``frames`` later in the same track."""
         return pl.col("x").shift(-frames).over(TRACK)
 
+    # Central differences of positions one second apart, of the first, second and third order.
+    way = x_at(_HALF) - x_at(-_HALF)
+    bend = x_at(_WHOLE) - 2.0 * pl.col("x") + x_at(-_WHOLE)
     late = _HALF
     later = _HALF + _WHOLE
-    # Central differences of positions one second apart.
-    bend = x_at(_WHOLE) - 2.0 * pl.col("x") + x_at(-_WHOLE)
     swing = x_at(later) - 3.0 * x_at(late) + 3.0 * x_at(-late) - x_at(-later)
+    second = _WHOLE * FRAME_S
+
     # Frames since the vehicle appeared.
     age = pl.col("frame") - pl.col("frame").first().over(TRACK)
     return frame.with_columns(
-        speed=(x_at(_HALF) - x_at(-_HALF)) / (_WHOLE * FRAME_S),
-        acceleration=bend / (_WHOLE * FRAME_S) ** 2,
-        jerk=swing / (_WHOLE * FRAME_S) ** 3,
+        speed=way / second,
+        acceleration=bend / second**2,
+        jerk=swing / second**3,
         stride=pl.col("x") - x_at(-1),
         counts=(age >= round(SETTLING_S / FRAME_S)) & pl.col("driven"),
     )
@@ -361,14 +456,18 @@ class Reference(Measured):
         return lane_change_rate(int(self.whole["lane_changes"]), self.whole["vehicle_km"])
 
     def save(self, path: Path) -> None:
-        """Write as JSON, atomically."""
+        """Write as JSON, atomically.
+
+        The ceilings are for who reads the file; :meth:`load` ignores them.
+        """
         content = {
             "kind": _KIND,
             "checksum": PLACE,
             "bins": _bins(),
-            "ceilings": {quantity: ceiling(counts) for quantity, counts in self.counts.items()},
+            "ceilings": {name: ceiling(counts) for name, counts in self.counts.items()},
             **vars(self),
-            "counts": {name: value.astype(int).tolist() for name, value in self.counts.items()},
+            # Arrays are no JSON.
+            "counts": {name: counts.astype(int).tolist() for name, counts in self.counts.items()},
         }
         write_json(path, content)
 
@@ -387,6 +486,7 @@ class Reference(Measured):
                 raise ValueError("another kind of file")
             if numbers["bins"] != _bins():
                 raise ValueError("its histograms have other bins")
+
             counts = {name: np.array(rows, float) for name, rows in numbers["counts"].items()}
             # Ceilings and checksum follow from the rest.
             values = {part.name: numbers[part.name] for part in fields(cls)}
@@ -403,6 +503,8 @@ class Reference(Measured):
                 f"{path}: not the histograms of recorded driving that the realism card needs "
                 f"({error}); give the recordings with data.path=FILE."
             ) from error
+
+        # Every reference is written with its checksum.
         if not whole:
             refuse_without_checksum(path)
         return reference

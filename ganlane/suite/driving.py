@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 from tqdm import tqdm
@@ -40,40 +39,59 @@ _ORIGIN = "ganlane"
 
 
 def compare(
-    drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = False, once: bool = False
+    drivers: Sequence[Driver],
+    config: EvaluateConfig,
+    quiet: bool = False,
+    once: bool = False,
 ) -> pl.DataFrame:
     """Run the episodes of ``config`` with each driver on each of its traffics.
 
-    Each of ``drivers`` (:func:`ganlane.build.make_driver`) drives with its own observation and
-    mask, or with those of ``config`` if it names none; the sensors are those of ``config`` for all.
-    The progress is a bar, without a terminal a line per driver and traffic; ``quiet`` shows none.
-    ``once``: where a traffic replays, no start of the recordings is driven twice
-    (:meth:`ganlane.traffic.ReplayTraffic.episodes_once`), so that there may be fewer episodes.
+    The progress is a bar, without a terminal a line per driver and traffic.
+
+    Args:
+        drivers: of :func:`ganlane.build.make_driver`. Each drives with its own observation and
+            mask, or with those of ``config`` if it names none; the sensors are those of ``config``
+            for all.
+        config: traffics, episodes, seed and environment.
+        quiet: no progress is shown.
+        once: where a traffic replays, no start of the recordings is driven twice
+            (:meth:`ganlane.traffic.ReplayTraffic.episodes_once`), so that there may be fewer
+            episodes.
 
     Returns:
         What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one
         below the other; and, where one of the traffics replays (null for the others), with
         ``scene``, the recorded scene of an episode, and ``car``, the recorded car that the ego
         replaces.
+
+    Raises:
+        UserError: a traffic cannot be made (:func:`ganlane.build.make_traffic`), or a driver does
+            not fit.
     """
     env = config.env
     seed = config.seed
-    episodes = config.episodes
     stream = Stream.named(config.stream)
+
     # All traffics are made first, so that one that cannot be made shows before any driving.
-    modules = {name: make_traffic(option, env, stream) for name, option in config.traffics.items()}
-    total = len(modules) * len(drivers) * episodes
+    modules = {}
+    for name, option in config.traffics.items():
+        modules[name] = make_traffic(option, env, stream)
+
     # One table per driver and traffic, concatenated at the end.
     tables = []
+    total = len(modules) * len(drivers) * config.episodes
     no_terminal = not sys.stderr.isatty()
     with tqdm(total=total, unit="episode", disable=quiet or no_terminal) as bar:
         for traffic, module in modules.items():
-            numbers: Sequence[int] = range(episodes)
+            numbers: Sequence[int] = range(config.episodes)
             if once and isinstance(module, ReplayTraffic):
-                numbers = module.episodes_once(seed, env.idm)[:episodes]
+                numbers = module.episodes_once(seed, env.idm)[: config.episodes]
+
             for driver in drivers:
                 title = f"{driver.name} on {traffic}"
                 bar.set_description(title)
+
+                # The settings with the driver's own observation and mask.
                 of_driver, policy = driver.driving(config)
                 # All but the number of rows, which shrinks towards the end.
                 make = partial(make_env, module, of_driver)
@@ -82,7 +100,11 @@ def compare(
                 table = run_episodes(batch, policy, numbers, seed, report, make)
                 if no_terminal and not quiet:
                     print(f"{title}: {table.height} episodes", file=sys.stderr)
-                table = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
+
+                table = table.with_columns(
+                    agent=pl.lit(driver.name),
+                    traffic=pl.lit(traffic),
+                )
                 # Episodes of one recorded scene are no independent observations.
                 if isinstance(module, ReplayTraffic):
                     driven = table["episode"].to_list()
@@ -91,6 +113,8 @@ def compare(
                         pl.Series("car", module.cars_of_episodes(seed, driven), pl.Int64),
                     )
                 tables.append(table)
+
+    # Only replayed episodes have a scene and a car, hence diagonal: the others get nulls.
     return pl.concat(tables, how="diagonal")
 
 
@@ -106,14 +130,22 @@ def drive_episode(
     episode: int,
     end_s: float | None = None,
 ) -> Trajectory:
-    """Record an episode of the seed and stream of ``config``, up to ``end_s``, for a film or page.
+    """Record an episode of the seed and stream of ``config``, for a film or page.
+
+    Args:
+        driver: who drives.
+        traffic: on what traffic; those of ``config`` do not count.
+        config: seed, stream and environment.
+        episode: its number.
+        end_s: when the record ends, s from the start; None: with the episode.
 
     Raises:
         UserError: see :func:`ganlane.build.make_traffic`.
     """
     # A trained agent brings the mask and the observation that it was trained with.
     driven, policy = driver.driving(config)
-    env = make_env(make_traffic(traffic, config.env, Stream.named(config.stream)), driven)
+    module = make_traffic(traffic, config.env, Stream.named(config.stream))
+    env = make_env(module, driven)
     return record_episode(env, policy, config.seed, episode, driver.name, traffic.label(), end_s)
 
 
@@ -121,7 +153,11 @@ def drive_episode(
 
 
 def available(config: BenchmarkConfig) -> tuple[list[str], dict[str, str]]:
-    """The traffics that can be driven on here, and the others with the reason why not."""
+    """The traffics that can be driven on here, and the others with the reason why not.
+
+    Raises:
+        UserError: a traffic of the score cannot be made.
+    """
     traffics = config.suite.traffics()
     missing = {}
     for name, option in traffics.items():
@@ -133,34 +169,49 @@ def available(config: BenchmarkConfig) -> tuple[list[str], dict[str, str]]:
             if name in config.suite.scored:
                 raise
             missing[name] = str(error)
-    return [name for name in traffics if name not in missing], missing
+
+    can_be_driven = [name for name in traffics if name not in missing]
+    return can_be_driven, missing
 
 
 def drive_suite(
-    drivers: Sequence[Driver], traffics: Sequence[str], config: BenchmarkConfig
+    drivers: Sequence[Driver],
+    traffics: Sequence[str],
+    config: BenchmarkConfig,
 ) -> tuple[pl.DataFrame, dict[str, float]]:
-    """The episodes of all cells, one below the other, and seconds by driver.
+    """Drive every driver on every traffic of a suite, traffic by traffic.
 
-    Cells that are stored are read, the others are driven, traffic by traffic.
+    Cells that are stored are read, the others are driven and stored.
+
+    Args:
+        drivers: the suite's and the agents.
+        traffics: names among those of the suite.
+        config: the suite, and ``cells``, the folder of what was driven.
+
+    Returns:
+        The episodes of all cells, one below the other, with the columns of :func:`compare`; and by
+        driver's name how long its cells took to drive, s, also where they were stored.
 
     Raises:
         UserError: a stored file without the episodes of a cell; the message names it.
     """
+    # Every driver on a traffic before the next traffic.
     cells = [(driver, alone) for alone in map(config.on, traffics) for driver in drivers]
+
     tables = []
     seconds: dict[str, float] = {}
-    no_terminal = not sys.stderr.isatty()
-    for driver, alone in tqdm(cells, unit="cell", disable=no_terminal):
+    for driver, alone in tqdm(cells, unit="cell", disable=not sys.stderr.isatty()):
         file = _file_of(driver, alone, Path(config.cells))
+        # What was driven before is not driven again.
         if file is not None and file.is_file():
             table, took_s = _read(file)
         else:
             table, took_s = _drive(driver, alone, file)
-            if no_terminal:
-                title = f"{driver.name} on {', '.join(alone.traffics)}"
-                print(f"{title}: {table.height} episodes", file=sys.stderr)
+
         tables.append(table)
         seconds[driver.name] = seconds.get(driver.name, 0.0) + took_s
+
+    # Cells of traffics that replay have columns more.
     return pl.concat(tables, how="diagonal"), seconds
 
 
@@ -171,31 +222,41 @@ def _file_of(driver: Driver, config: EvaluateConfig, folder: Path) -> Path | Non
     """
     if not isinstance(driver.policy, GreedyPolicy | RuleDriver | StoredModel):
         return None
+
     # The weights themselves, not a file's name: a training under the same name is another driver.
     weights = hashlib.sha256()
     for name, value in driver.policy.state_dict().items():
         # Noise for exploring is drawn anew by every process.
         if not name.endswith("_epsilon"):
             weights.update(value.cpu().numpy().tobytes())
+
+    # With the observation and the mask that the driver brings.
     driven, _ = driver.driving(config)
-    settings: dict[str, Any] = asdict(driven)
+    settings = asdict(driven)
     # They change how fast the cell is driven, not what happens.
     for name in ("threads", "columns", "num_envs", "agents"):
         del settings[name]
+
     settings |= {
         "driver": driver.name,
         "weights": weights.hexdigest(),
+        # By their keys alone: other fields are no settings.
         "traffics": {name: plain(item) for name, item in config.traffics.items()},
     }
+
+    # Sorted, so that the same settings have the same name whatever their order.
     text = json.dumps(settings, sort_keys=True, default=str)
-    return folder / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.parquet"
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    return folder / f"{digest[:32]}.parquet"
 
 
 def _drive(driver: Driver, config: EvaluateConfig, file: Path | None) -> tuple[pl.DataFrame, float]:
     """Drive one cell and store it; its episodes, and the seconds that it took."""
     begun = time.monotonic()
-    table = compare([driver], config, quiet=True, once=True)
+    # On a terminal the bar of all cells tells how far it is, else a line for each of them.
+    table = compare([driver], config, quiet=sys.stderr.isatty(), once=True)
     took_s = time.monotonic() - begun
+
     if file is not None:
         # The file tells where it comes from, whoever finds it.
         origin = json.dumps({"code": code_version(), "seconds": took_s})
@@ -205,8 +266,9 @@ def _drive(driver: Driver, config: EvaluateConfig, file: Path | None) -> tuple[p
 
 
 def _read(path: Path) -> tuple[pl.DataFrame, float]:
-    """A stored cell."""
+    """A stored cell: what :func:`_drive` returned; :class:`UserError` for another file."""
     try:
+        # The metadata first: a table without them is no cell.
         origin = json.loads(pl.read_parquet_metadata(path)[_ORIGIN])
         return pl.read_parquet(path), float(origin["seconds"])
     except (OSError, KeyError, ValueError, TypeError, pl.exceptions.PolarsError) as error:

@@ -42,11 +42,12 @@ def compare(
     drivers: Sequence[Driver],
     config: EvaluateConfig,
     quiet: bool = False,
-    once: bool = False,
 ) -> pl.DataFrame:
     """Run the episodes of ``config`` with each driver on each of its traffics.
 
-    The progress is a bar, without a terminal a line per driver and traffic.
+    The progress is a bar, without a terminal a line per driver and traffic. Where a traffic
+    replays, no start of the recordings is driven twice
+    (:meth:`ganlane.traffic.ReplayTraffic.episodes_once`), so that there may be fewer episodes.
 
     Args:
         drivers: of :func:`ganlane.build.make_driver`. Each drives with its own observation and
@@ -54,9 +55,6 @@ def compare(
             for all.
         config: traffics, episodes, seed and environment.
         quiet: no progress is shown.
-        once: where a traffic replays, no start of the recordings is driven twice
-            (:meth:`ganlane.traffic.ReplayTraffic.episodes_once`), so that there may be fewer
-            episodes.
 
     Returns:
         What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one
@@ -65,8 +63,8 @@ def compare(
         replaces.
 
     Raises:
-        UserError: a traffic cannot be made (:func:`ganlane.build.make_traffic`), or a driver does
-            not fit.
+        UserError: a traffic cannot be made (:func:`ganlane.build.make_traffic`), its recordings
+            have no start that can be driven, or a driver does not fit.
     """
     env = config.env
     seed = config.seed
@@ -84,7 +82,7 @@ def compare(
     with tqdm(total=total, unit="episode", disable=quiet or no_terminal) as bar:
         for traffic, module in modules.items():
             numbers: Sequence[int] = range(config.episodes)
-            if once and isinstance(module, ReplayTraffic):
+            if isinstance(module, ReplayTraffic):
                 numbers = module.episodes_once(seed, env.idm)[: config.episodes]
 
             for driver in drivers:
@@ -254,7 +252,7 @@ def _drive(driver: Driver, config: EvaluateConfig, file: Path | None) -> tuple[p
     """Drive one cell and store it; its episodes, and the seconds that it took."""
     begun = time.monotonic()
     # On a terminal the bar of all cells tells how far it is, else a line for each of them.
-    table = compare([driver], config, quiet=sys.stderr.isatty(), once=True)
+    table = compare([driver], config, quiet=sys.stderr.isatty())
     took_s = time.monotonic() - begun
 
     if file is not None:

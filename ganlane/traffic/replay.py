@@ -268,6 +268,9 @@ class ReplayTraffic(TrafficModule):
         Every start is driven once. Left out are those at which the ego, which follows by ``idm``,
         would brake beyond :data:`HARD_BRAKING_MPS2` at once: the recorded driver was nearer to the
         vehicle ahead than IDM ever is, and a crash there is none of the agent's.
+
+        Raises:
+            UserError: no start is left.
         """
         # Scenes are equally likely, so a start of the longest scene comes once in so many episodes.
         rarest = len(self.scene_names) * int(self.starts_in.max())
@@ -279,6 +282,11 @@ class ReplayTraffic(TrafficModule):
         vehicles = self.scenes(MOST_VEHICLES)(key, torch.float32)
         scene = perceive(vehicles, self.road_of(key), slice(0, 1))
         softly = following_acceleration(scene, idm)[:, 0] >= HARD_BRAKING_MPS2
+        if not softly.any():
+            raise UserError(
+                f"{self.source}: at every start the ego would have to brake harder than "
+                f"{-HARD_BRAKING_MPS2:g} m/s2 at once; give other recordings."
+            )
         return numbers[softly.cpu()].tolist()
 
     def _starts_of(self, seed: int, episodes: Sequence[int]) -> Tensor:

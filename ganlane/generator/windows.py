@@ -234,7 +234,7 @@ def _present_throughout(scene: Recording, frames: int) -> np.ndarray:
 
     # [rows, V, frames]
     windows = sliding_window_view(scene.present, frames, axis=0)
-    return windows.all(axis=-1)
+    return np.all(windows, axis=-1)
 
 
 def count_windows(scene: Recording) -> int:

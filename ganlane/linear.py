@@ -23,7 +23,12 @@ _LIBRARY.define("linear(Tensor x, Tensor weight, Tensor? bias, bool relu) -> Ten
 
 
 @torch.library.impl(_LIBRARY, "linear", "CPU")
-def _operator(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
+def _operator(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    relu: bool,
+) -> Tensor:
     """What the operator computes; the arguments are those of :func:`matrix_product`."""
     if ONEDNN:
         after = "relu" if relu else "none"
@@ -35,7 +40,12 @@ def _operator(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Ten
 
 
 @torch.library.register_fake("ganlane::linear")
-def _shape(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
+def _shape(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    relu: bool,
+) -> Tensor:
     """An empty result, from which a compiler learns shape and type without computing."""
     return x.new_empty((*x.shape[:-1], weight.shape[0]))
 
@@ -46,7 +56,10 @@ def has_fast_product(x: Tensor) -> bool:
 
 
 def matrix_product(
-    x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    relu: bool = False,
 ) -> Tensor:
     """:func:`linear` in float32 on a CPU, without a gradient, in eager and in compiled graphs.
 
@@ -59,7 +72,12 @@ def matrix_product(
     return torch.ops.ganlane.linear(x, weight, bias, relu)
 
 
-def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tensor:
+def linear(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    relu: bool = False,
+) -> Tensor:
     """``x @ weight.T + bias``, then a ReLU if asked for, with gradients.
 
     By oneDNN where ``x`` is float32 on a CPU and has two dimensions.

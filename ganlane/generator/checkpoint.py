@@ -104,7 +104,10 @@ def load_human(path: str | Path) -> tuple[HumanModel, dict[str, Any]]:
 
 
 def with_weights(
-    kind: Callable[[Any], Network], sizes: Any, weights: Mapping[str, Any], path: object = "weights"
+    kind: Callable[[Any], Network],
+    sizes: Any,
+    weights: Mapping[str, Any],
+    path: object = "weights",
 ) -> Network:
     """A network with these tensors or arrays, in evaluation mode, without gradients.
 

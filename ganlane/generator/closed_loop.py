@@ -102,7 +102,12 @@ def push(generator: Generator, history: History, displacement: Tensor) -> tuple[
     return History(motions, displacement), difference
 
 
-def observe(history: History, difference: Tensor, vehicles: Vehicles, extra: Tensor) -> Observation:
+def observe(
+    history: History,
+    difference: Tensor,
+    vehicles: Vehicles,
+    extra: Tensor,
+) -> Observation:
     """The generator's input after :func:`push`.
 
     Args:
@@ -177,7 +182,10 @@ def wander(noise: Tensor, fresh: Tensor, period_s: float) -> Tensor:
 
 
 def paper_step(
-    generator: Generator, vehicles: Vehicles, history: History, noise: Tensor
+    generator: Generator,
+    vehicles: Vehicles,
+    history: History,
+    noise: Tensor,
 ) -> tuple[Vehicles, History]:
     """One step of the paper's preset: vehicles 0.1 s later, and their history.
 
@@ -235,7 +243,11 @@ def extra_inputs(scene: Scene, anchor: Tensor, offset: Tensor) -> Tensor:
 
 
 def inside_lane(
-    residual: Tensor, offset: Tensor, velocity: Tensor, room: Tensor, damping: float
+    residual: Tensor,
+    offset: Tensor,
+    velocity: Tensor,
+    room: Tensor,
+    damping: float,
 ) -> Tensor:
     """The lateral residual [N, M], m/s2, without what would move the body out of its lane.
 

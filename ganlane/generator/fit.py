@@ -300,7 +300,12 @@ def predicted_steps(config: Config) -> int:
 HeldOut = tuple[np.ndarray, Forecasts]
 
 
-def held_out_errors(task: Task, scenes: list[Recording], steps: int, stride: int) -> HeldOut:
+def held_out_errors(
+    task: Task,
+    scenes: list[Recording],
+    steps: int,
+    stride: int,
+) -> HeldOut:
     """Errors of forecasts of held-out scenes: by the fit, constant velocity and IDM.
 
     Args:
@@ -323,7 +328,10 @@ def held_out_errors(task: Task, scenes: list[Recording], steps: int, stride: int
 
 
 def errors_beside_references(
-    forecasts: Forecasts, windows: Windows, scenes: list[Recording], stride: int
+    forecasts: Forecasts,
+    windows: Windows,
+    scenes: list[Recording],
+    stride: int,
 ) -> Forecasts:
     """Errors of forecasts, of constant velocity's and of IDM's with each driver's own headway.
 

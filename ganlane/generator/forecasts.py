@@ -155,7 +155,11 @@ def by_kind(samples: np.ndarray, recorded: np.ndarray) -> Forecasts:
 
 @torch.no_grad()
 def paper_forecasts(
-    generator: Generator, windows: Windows, groups: Groups, seed: int, samples: int
+    generator: Generator,
+    windows: Windows,
+    groups: Groups,
+    seed: int,
+    samples: int,
 ) -> np.ndarray:
     """Forecasts [1 + K, W, T, 2] by the paper's preset, open loop; the first has z = 0.
 
@@ -189,7 +193,11 @@ def paper_forecasts(
 
 @torch.no_grad()
 def driven_windows(
-    driver: Driver, scenes: list[Recording], horizon: int, stride: int, times: int = 1
+    driver: Driver,
+    scenes: list[Recording],
+    horizon: int,
+    stride: int,
+    times: int = 1,
 ) -> np.ndarray:
     """Forecasts [K, W, H, 2] in m by a driver, of all windows of 9 + H frames.
 
@@ -319,6 +327,12 @@ def rollout_score(generator: Generator, scenes: list[Recording], config: Calibra
 def mean_by_step(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
     """Mean [H] of errors [B, H, V] where their mask [B, H, V] is true, over all parts."""
     # Sums and counts are pooled first, since batches differ in their number of vehicles.
-    counts = torch.stack([scored.sum((0, 2)) for _, scored in parts])
-    totals = torch.stack([(errors * scored).sum((0, 2)) for errors, scored in parts])
-    return totals.sum(0) / counts.sum(0).clamp_min(1)
+    counts = []
+    totals = []
+    for errors, scored in parts:
+        counts.append(scored.sum((0, 2)))
+        totals.append((errors * scored).sum((0, 2)))
+
+    # A step at which nobody counts has an error of 0.
+    count = torch.stack(counts).sum(0).clamp_min(1)
+    return torch.stack(totals).sum(0) / count

@@ -142,7 +142,8 @@ class Tokens(NamedTuple):
         upper = chance.cumsum(-1)
 
         # The token in which u lies; rounding may leave the last upper end below 1.
-        token = (upper < u[..., None]).sum(-1, keepdim=True).clamp_max(self.number - 1)
+        token = (upper < u[..., None]).sum(-1, keepdim=True)
+        token = token.clamp_max(self.number - 1)
         token_chance = chance.gather(-1, token)[..., 0].clamp_min(1e-9)
         token_lower = upper.gather(-1, token)[..., 0] - token_chance
 
@@ -258,7 +259,12 @@ def velocity(vehicles: Vehicles) -> tuple[Tensor, Tensor]:
     return along, across
 
 
-def lane_after(y: Tensor, aside: Tensor, road: Road, seconds: float) -> Tensor:
+def lane_after(
+    y: Tensor,
+    aside: Tensor,
+    road: Road,
+    seconds: float,
+) -> Tensor:
     """The lane that a vehicle is in some time later, at most the next one.
 
     Args:
@@ -312,7 +318,12 @@ def perceive(vehicles: Vehicles, road: Road, sides: bool = True) -> View:
 
 
 def _nearest_on(
-    side: int, scene: Scene, lanes: Tensor, speed: Tensor, aside: Tensor, sides: bool
+    side: int,
+    scene: Scene,
+    lanes: Tensor,
+    speed: Tensor,
+    aside: Tensor,
+    sides: bool,
 ) -> Near:
     """The nearest vehicles ahead (``side`` 1) or behind (-1) in ``lanes`` [N, M, 3].
 
@@ -353,7 +364,11 @@ class Situation(NamedTuple):
 
 
 def situation_of(
-    vehicles: Vehicles, memory: Memory, road: Road, sides: bool = True, first: Tensor | None = None
+    vehicles: Vehicles,
+    memory: Memory,
+    road: Road,
+    sides: bool = True,
+    first: Tensor | None = None,
 ) -> Situation:
     """What drivers perceive now, with this decision's style in their memory.
 
@@ -812,7 +827,13 @@ def moved(vehicles: Vehicles, acceleration: Tensor, aside: Tensor) -> Vehicles:
     return with_velocity(vehicles, speed_later, aside)
 
 
-def cars(x: Tensor, y: Tensor, speed: Tensor, aside: Tensor, **others: Tensor) -> Vehicles:
+def cars(
+    x: Tensor,
+    y: Tensor,
+    speed: Tensor,
+    aside: Tensor,
+    **others: Tensor,
+) -> Vehicles:
     """Vehicles [N, M] at these speeds, which others see in the lanes where their centres are.
 
     Args:

@@ -217,7 +217,12 @@ def fit_estimator(
     estimator.requires_grad_(False)
 
 
-def noise_shares(rows: int, without: float, as_recorded: float, random: torch.Generator) -> Tensor:
+def noise_shares(
+    rows: int,
+    without: float,
+    as_recorded: float,
+    random: torch.Generator,
+) -> Tensor:
     """Shares [rows, 1, 1] of the recorded noise, from 0 to 1.2.
 
     Args:

@@ -109,9 +109,13 @@ class Material(NamedTuple):
 
 
 def material_of(scenes: Sequence[SmoothScene], random: torch.Generator) -> Material:
-    """Everything that a policy is fitted to, cut from smoothed ``scenes``.
+    """Everything that a policy is fitted to.
 
     Stretches overlap: they begin every few frames of 0.1 s, more often where scenes are few.
+
+    Args:
+        scenes: smoothed ones, of several lanes and of one.
+        random: draws the prior.
     """
     wide = [scene for scene in scenes if scene.two_dimensional]
     narrow = [scene for scene in scenes if not scene.two_dimensional]
@@ -233,17 +237,29 @@ def close_the_loop(
 
 
 def _gathered(
-    material: Material, options: Options, config: HumanConfig, random: torch.Generator, times: int
+    material: Material,
+    options: Options,
+    config: HumanConfig,
+    random: torch.Generator,
+    times: int,
 ) -> Samples:
-    """Samples of all stretches: of scenes ``times`` over, of single lanes once.
+    """Samples of all stretches: of scenes several times, of single lanes once.
 
     Passes differ by what is drawn: sides swapped or hidden, lanes widened, moves of the policy. In
     the last pass the way is lengthened by up to ``config.scale``: the same traffic, but faster.
+
+    Args:
+        material: with the stretches.
+        options: who drives, and what is varied.
+        config: by how much the way is lengthened.
+        random: draws what differs.
+        times: passes over the scenes.
     """
     scales = [0.0] * (times - 1) + [config.scale]
     parts = []
     for scale in scales:
-        parts.append(samples_of(material.around, options._replace(scale=scale), random))
+        scaled = options._replace(scale=scale)
+        parts.append(samples_of(material.around, scaled, random))
 
     if material.ahead:
         # Cars of one lane have no sides to be hidden, and nothing to be mirrored.
@@ -284,7 +300,8 @@ def train_moves(
             # The batch [B], and beside it [P] of the prior's samples.
             beside = int(PRIOR_SHARE * len(batch))
             of_prior = torch.randint(len(prior.change), (beside,), generator=random)
-            both = Moves(*map(torch.cat, zip(moves.rows(batch), prior.rows(of_prior))))
+            pairs = zip(moves.rows(batch), prior.rows(of_prior))
+            both = Moves(*map(torch.cat, pairs))
 
             # Logits [B + P, tokens] of what is seen with a little noise.
             noise = INPUT_NOISE * torch.randn(both.features.shape, generator=random)
@@ -306,7 +323,10 @@ def train_moves(
 
 
 def train_lane_choice(
-    policy: HumanPolicy, choices: Choices, danger: Tensor, random: torch.Generator
+    policy: HumanPolicy,
+    choices: Choices,
+    danger: Tensor,
+    random: torch.Generator,
 ) -> None:
     """Fit when a lane change begins, and when one is broken off.
 
@@ -365,6 +385,10 @@ def match_rate(policy: HumanPolicy, choices: Choices) -> None:
 
     Where recorded drivers took gaps that count as danger here, no change begins; others make up for
     it. Only the level is moved: the bias of all beginnings.
+
+    Args:
+        policy: it is changed in place.
+        choices: recorded ones.
     """
     wanted = begins_per_decision(choices)
     _, bias = policy.lane[-1].parameters()
@@ -388,8 +412,10 @@ class PriorDrivers(NamedTuple):
     """IDM drivers in random scenes, [N, M] each; ``vehicles`` do not accelerate yet.
 
     Attributes:
+        vehicles: where they are, how fast, and where they head for.
         lane: whose centre a driver swings back to, int64; it may head for another one.
-        speed, aside: along and across the road as drawn, m/s.
+        speed: along the road as drawn, m/s.
+        aside: across the road as drawn, m/s.
         headway: that the driver keeps, s.
     """
 
@@ -405,6 +431,11 @@ def prior_drivers(road: Road, scenes: int, random: torch.Generator) -> PriorDriv
 
     Speeds are 0 to 38 m/s, headways around 1.25 s (log-normal, 0.5 to 3 s). The drivers of a scene
     are about equally fast, at a density of its own: 60 to 560 m for all of them.
+
+    Args:
+        road: with three lanes or more.
+        scenes: N, how many there are.
+        random: draws the drivers.
     """
     # The order of the draws is part of a fit.
     shape = (scenes, PRIOR_VEHICLES)
@@ -422,9 +453,14 @@ def prior_drivers(road: Road, scenes: int, random: torch.Generator) -> PriorDriv
     speed = (pace + apart).clamp(0.0, 38.0)
     speed = torch.where(rand() < 0.08, 3.0 * rand(), speed)
 
-    # Half of the drivers would like to go as fast as they do, or up to 8 m/s faster.
-    desired = torch.where(rand() < 0.5, 14.0 + 20.0 * rand(), speed + 8.0 * rand())
+    # Half of the drivers would like to go as fast as they do, or up to 8 m/s faster; the others
+    # have a wish that does not depend on how fast they are.
+    independent = rand() < 0.5
+    wish = 14.0 + 20.0 * rand()
+    desired = torch.where(independent, wish, speed + 8.0 * rand())
+
     headway = torch.exp(math.log(1.25) + 0.42 * randn()).clamp(0.5, 3.0)
+    # Who is between two lanes moves across the road more.
     aside = torch.where(astray, 0.45, 0.15) * randn()
 
     zero = torch.zeros(shape)
@@ -465,7 +501,10 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
         max_acceleration=1.4,
     )
     wanted = following_acceleration(scene_of(vehicles, road), with_headways(idm, headway))
-    before = torch.where(rand() < 0.5, 0.6 * randn(), (wanted * rand()).clamp(-6.0, 2.0))
+    otherwise = rand() < 0.5
+    something_else = 0.6 * randn()
+    in_part = (wanted * rand()).clamp(-6.0, 2.0)
+    before = torch.where(otherwise, something_else, in_part)
     vehicles = vehicles.with_(acceleration=before)
     view = perceive(vehicles, road)
 

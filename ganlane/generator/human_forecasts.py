@@ -145,7 +145,12 @@ def human_driver(model: HumanModel, samples: int) -> Driver:
     return partial(_driven, model, samples, random)
 
 
-def _driven(model: HumanModel, samples: int, random: torch.Generator, segments: Segments) -> Tensor:
+def _driven(
+    model: HumanModel,
+    samples: int,
+    random: torch.Generator,
+    segments: Segments,
+) -> Tensor:
     """Positions [1 + samples, B, H, V, 2] in m; the first are the mean driver's.
 
     All drivers of a run move together, so that they react to each other's forecasts.

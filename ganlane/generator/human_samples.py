@@ -167,7 +167,12 @@ def without_noise(recording: Recording, config: HumanConfig) -> SmoothScene:
     return replace(scene, raw_x=scene.x, raw_y=scene.y)
 
 
-def target_lanes(y: Floats, lateral_speed: Floats, width_m: float, lanes: int) -> np.ndarray:
+def target_lanes(
+    y: Floats,
+    lateral_speed: Floats,
+    width_m: float,
+    lanes: int,
+) -> np.ndarray:
     """The lane [T] that a driver heads for: from the start of a change on the new one.
 
     A change counts if the track stays for 0.5 s in each of the two lanes.
@@ -724,7 +729,11 @@ def _led_back(segments: Segments, now: int, situation: Situation) -> tuple[Tenso
 
 
 def _nearest_move(
-    options: Options, features: Tensor, change: Tensor, aside: Tensor, random: torch.Generator
+    options: Options,
+    features: Tensor,
+    change: Tensor,
+    aside: Tensor,
+    random: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Of several moves that the policy draws, the nearest to a wanted one, along and across alone.
 

@@ -148,6 +148,10 @@ class Strangers(NamedTuple):
     def moves(self, vehicles: Vehicles, road: Road) -> tuple[Tensor, Tensor]:
         """Accelerations, m/s2, and lateral speeds, m/s, [N, M]: IDM behind others, at their own
         pace.
+
+        Args:
+            vehicles: all of them, [N, M].
+            road: that they are on.
         """
         unlimited = vehicles.with_(desired_speed=torch.full_like(self.pace, NO_LIMIT_MPS))
         behind = following_acceleration(scene_of(unlimited, road), TABLE_V)
@@ -286,17 +290,21 @@ def tune(
 
 def begins_per_decision(teacher: Choices) -> float:
     """Lane changes begun per recorded decision of a driver in its lane."""
-    return float((teacher.begins == 1).sum()) / max(1, len(teacher.keeping_sides))
+    begun = (teacher.begins == 1).sum()
+    return float(begun) / max(1, len(teacher.keeping_sides))
 
 
 def _values(critic: nn.Module, features: Tensor, sides: Tensor) -> Tensor:
     """The critic's values [...] of features [..., FEATURES] and sides [..., 2, SIDE_FEATURES]."""
-    return critic(torch.cat((features, sides.flatten(-2)), -1))[..., 0]
+    inputs = torch.cat((features, sides.flatten(-2)), -1)
+    return critic(inputs)[..., 0]
 
 
 def advantages(decisions: Decisions) -> tuple[Tensor, Tensor]:
-    """Advantages and values to learn, [T, N, M]: generalised advantage estimation (Schulman et al.
-    2016, equation 16).
+    """Advantages, and values for the critic to learn, [T, N, M].
+
+    Generalised advantage estimation (Schulman et al. 2016, equation 16): the value of a decision is
+    what it was taken for, and by how much the rewards that followed were better.
     """
     reward = -decisions.cost
     value = decisions.value
@@ -331,10 +339,16 @@ def _log_chances(policy: HumanPolicy, features: Tensor, choice: LaneChoice) -> t
 
 
 def _of_actions(chances: tuple[Tensor, ...], actions: Tensor) -> Tensor:
-    """Logarithm of the chance of the ``actions`` [..., 3]: tokens along and across, lane choice."""
+    """Logarithm of the chance of what was done, [...].
+
+    Args:
+        chances: of :func:`_log_chances`.
+        actions: tokens along and across, lane choice, [..., 3].
+    """
     taken = []
     for log_chances, action in zip(chances, actions.unbind(-1)):
-        taken.append(log_chances.gather(-1, action[..., None])[..., 0])
+        of_action = log_chances.gather(-1, action[..., None])
+        taken.append(of_action[..., 0])
     # A product of chances: both tokens are drawn after the lane choice, each for itself.
     return torch.stack(taken).sum(0)
 
@@ -585,9 +599,10 @@ def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road, Stra
     sparse = torch.where(rand_of_scene() < 0.5, 1.0, 1.0 + 4.0 * rand_of_scene())
     # Six vehicles in a hundred are lorries.
     length = torch.where(rand() < 0.06, 12.0, 4.2 + 0.8 * rand())
-    # Log-normal about 1.3 s. From the front of one vehicle to that of the next, m.
-    headway_s = torch.exp(math.log(1.3) + 0.45 * randn()).clamp(0.6, 5.0) * sparse
-    space = headway_s * speed + 3.0 + length
+
+    # From the front of one vehicle to that of the next, m. Headways are log-normal about 1.3 s.
+    headway_s = torch.exp(math.log(1.3) + 0.45 * randn()).clamp(0.6, 5.0)
+    space = headway_s * sparse * speed + 3.0 + length
 
     # Fronts, m: one behind another in each lane.
     zero = torch.zeros(shape)
@@ -598,7 +613,12 @@ def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road, Stra
         front = torch.where(here, behind, front)
 
     # In half of the scenes the present speed and up to 10 m/s more, in the others 18 to 26 m/s.
-    desired = torch.where(rand_of_scene() < 0.5, speed + 10.0 * rand(), 18.0 + 8.0 * rand())
+    as_they_drive = rand_of_scene() < 0.5
+    faster = speed + 10.0 * rand()
+    wish = 18.0 + 8.0 * rand()
+    desired = torch.where(as_they_drive, faster, wish)
+
+    # Drivers are up to half a metre from the centre of their lane.
     off_centre = 0.25 * randn().clamp(-2.0, 2.0)
     vehicles = cars(
         front - 0.5 * length,
@@ -615,9 +635,15 @@ def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road, Stra
 
     # Half of the strangers are slow, some brake hard.
     there = (rand() < STRANGERS) & (rand_of_scene() < WITH_STRANGERS)
-    pace = torch.where(rand() < 0.5, 8.0 * rand(), 8.0 + 20.0 * rand())
-    braking = 1.0 + 4.0 * rand()
-    return vehicles, memory, road, Strangers(there, pace, braking)
+    is_slow = rand() < 0.5
+    slow = 8.0 * rand()
+    usual = 8.0 + 20.0 * rand()
+    strangers = Strangers(
+        there,
+        pace=torch.where(is_slow, slow, usual),
+        braking=1.0 + 4.0 * rand(),
+    )
+    return vehicles, memory, road, strangers
 
 
 def entering_memory(vehicles: Vehicles, road: Road, drawn: Tensor) -> Memory:

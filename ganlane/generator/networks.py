@@ -40,7 +40,12 @@ RANGE_M = 100.0
 _MANY_ROWS = 512
 
 
-def dense(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
+def dense(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    relu: bool = False,
+) -> Tensor:
     """A linear layer [..., O].
 
     Args:
@@ -217,7 +222,13 @@ class PairPooling(nn.Module):
         neighbours: how many count; 0: no pooling.
     """
 
-    def __init__(self, hidden: int, inner: int, pooled: int, neighbours: int):
+    def __init__(
+        self,
+        hidden: int,
+        inner: int,
+        pooled: int,
+        neighbours: int,
+    ):
         super().__init__()
         self.neighbours = neighbours
         # Only this layer has a bias, since the two terms are added.
@@ -226,7 +237,11 @@ class PairPooling(nn.Module):
         self.second = nn.Linear(inner, pooled)
 
     def forward(
-        self, hidden: Tensor, position: Tensor, displacement: Tensor, valid: Tensor
+        self,
+        hidden: Tensor,
+        position: Tensor,
+        displacement: Tensor,
+        valid: Tensor,
     ) -> Tensor:
         """Pooled states [B, G, P] of the vehicles.
 
@@ -338,7 +353,13 @@ class Generator(nn.Module):
         inner = apply(first, inputs, relu=True)
         return apply(second, inner)
 
-    def decode(self, context: Tensor, noise: Tensor, now: Observation, steps: int) -> Tensor:
+    def decode(
+        self,
+        context: Tensor,
+        noise: Tensor,
+        now: Observation,
+        steps: int,
+    ) -> Tensor:
         """Output [..., steps, 2] of the decoder's first steps, in units of ``DIFFERENCE_SCALE_M``.
 
         Each output is the change of the displacement that the next step continues.

@@ -65,7 +65,8 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Mean of ``values`` where ``mask`` (broadcast) is true; 0 if it is nowhere."""
     # At least one, so that an empty mask gives 0 instead of NaN.
     weight = mask.expand_as(values).to(values.dtype)
-    return (values * weight).sum() / weight.sum().clamp_min(1.0)
+    count = weight.sum().clamp_min(1.0)
+    return (values * weight).sum() / count
 
 
 class _Task(nn.Module):
@@ -221,7 +222,11 @@ class PaperTask(_Task):
         return float(errors.mean())
 
     def forecasts(
-        self, scenes: list[Recording], steps: int, stride: int, samples: int
+        self,
+        scenes: list[Recording],
+        steps: int,
+        stride: int,
+        samples: int,
     ) -> np.ndarray:
         """Forecasts [1 + K, W, T, 2] of the windows of ``scenes``; the first is the mean one.
 
@@ -296,8 +301,13 @@ class CalibratedTask(_Task):
         for scene in fitted:
             for row in segment_starts(scene, longest):
                 cuts.append((scene, row))
+
+        def vehicles_at_start(cut: tuple[Recording, int]) -> int:
+            scene, row = cut
+            return int(scene.present[row].sum())
+
         # Sorted by their vehicles, so that neighbours need little padding.
-        self.cuts = sorted(cuts, key=lambda cut: int(cut[0].present[cut[1]].sum()))
+        self.cuts = sorted(cuts, key=vehicles_at_start)
 
         # Some 64 of them, evenly spread, measure constant velocity well enough.
         stride = max(1, len(self.cuts) // 64)
@@ -336,9 +346,20 @@ class CalibratedTask(_Task):
         return rollout_score(self.generator, self.validation, self.config)
 
     def forecasts(
-        self, scenes: list[Recording], steps: int, stride: int, samples: int
+        self,
+        scenes: list[Recording],
+        steps: int,
+        stride: int,
+        samples: int,
     ) -> np.ndarray:
-        """Forecasts [1 + K, W, T, 2] of the windows of ``scenes``; the first is the mean one."""
+        """Forecasts [1 + K, W, T, 2] of the windows of ``scenes``; the first is the mean one.
+
+        Args:
+            scenes: recordings.
+            steps: T, of 0.1 s.
+            stride: frames between the starts of two windows.
+            samples: K, the forecasts that are drawn.
+        """
         driver = calibrated_driver(self.generator, self.config, samples)
         return driven_windows(driver, scenes, steps, stride, 1 + samples)
 
@@ -352,13 +373,16 @@ class CalibratedTask(_Task):
         drawn = torch.multinomial(shares, 1, generator=self.random)
         horizon = config.horizons[int(drawn)]
 
-        # Random ones among neighbours in the order of their size.
+        # Random ones among neighbours in the order of their size: from a place on, eight times as
+        # many as are wanted.
         span = min(len(self.cuts), 8 * config.batch)
-        begin = int(torch.randint(len(self.cuts) - span + 1, (), generator=self.random))
+        places = len(self.cuts) - span + 1
+        begin = int(torch.randint(places, (), generator=self.random))
         rows = begin + torch.randperm(span, generator=self.random)[: config.batch]
         cuts = [self.cuts[row] for row in rows.tolist()]
         segments = cut_segments(cuts, horizon)
 
+        # Left and right are alike.
         if float(torch.rand((), generator=self.random)) < 0.5:
             return segments.mirrored()
         return segments
@@ -412,9 +436,20 @@ class HumanTask(nn.Module):
         return steps
 
     def forecasts(
-        self, scenes: list[Recording], steps: int, stride: int, samples: int
+        self,
+        scenes: list[Recording],
+        steps: int,
+        stride: int,
+        samples: int,
     ) -> np.ndarray:
-        """Forecasts [1 + K, W, T, 2] of the windows of ``scenes``; the first is the mean one."""
+        """Forecasts [1 + K, W, T, 2] of the windows of ``scenes``; the first is the mean one.
+
+        Args:
+            scenes: recordings.
+            steps: T, of 0.1 s.
+            stride: frames between the starts of two windows.
+            samples: K, the forecasts that are drawn.
+        """
         driver = human_driver(self.generator, samples)
         return driven_windows(driver, scenes, steps, stride, 1 + samples)
 

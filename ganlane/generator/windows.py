@@ -131,8 +131,20 @@ def segment_starts(scene: Recording, horizon: int, stride: int = 1) -> list[int]
     return starts
 
 
-def segment_batches(scene: Recording, horizon: int, stride: int, size: int) -> Iterator[Segments]:
-    """All segments that start every ``stride`` frames, ``size`` at a time."""
+def segment_batches(
+    scene: Recording,
+    horizon: int,
+    stride: int,
+    size: int,
+) -> Iterator[Segments]:
+    """All segments of a scene that hold a driven vehicle.
+
+    Args:
+        scene: a recording.
+        horizon: frames after the present.
+        stride: frames between two starts.
+        size: how many segments are in a batch; the last one may have fewer.
+    """
     cuts = [(scene, row) for row in segment_starts(scene, horizon, stride)]
     for first in range(0, len(cuts), size):
         yield cut_segments(cuts[first : first + size], horizon)
@@ -147,11 +159,14 @@ def cut_segments(cuts: list[tuple[Recording, int]], horizon: int) -> Segments:
     """
     frames = OBSERVED_POSITIONS + horizon
 
-    # Who is recorded in any frame of a segment is in it.
     members = []
+    lengths = []
     for scene, row in cuts:
+        # Who is recorded in any frame of a segment is in it.
         recorded = scene.present[row : row + frames].any(0)
-        members.append(np.flatnonzero(recorded))
+        who = np.flatnonzero(recorded)
+        members.append(who)
+        lengths.append(scene.length[who].astype(np.float32))
 
     def taken(name: str) -> list[np.ndarray]:
         """A field in the frames of each segment, of its vehicles."""
@@ -167,7 +182,6 @@ def cut_segments(cuts: list[tuple[Recording, int]], horizon: int) -> Segments:
         middle = np.array([places[PRESENT, :, 0].mean(), 0.0])
         positions.append((places - middle).astype(np.float32))
 
-    lengths = [scene.length[who].astype(np.float32) for (scene, _), who in zip(cuts, members)]
     lanes = [[scene.lanes] for scene, _ in cuts]
     widths = [[scene.lane_width_m] for scene, _ in cuts]
     return Segments(

@@ -251,10 +251,13 @@ def error_in(difference: Tensor, scales: tuple[float, ...]) -> Tensor:
 
 
 def _tracks(scenes: Sequence[SmoothScene]) -> tuple[Tensor, Tensor, Tensor]:
-    """Nine recorded and smoothed positions [R, 9, 2], and the motion at the last one [R, 7].
+    """What the estimator is fitted to, of all drivers every 0.2 s; float64, since places on the
+    road are large numbers.
 
-    In float64, since places on the road are large numbers. The motion ends with the smoothed place
-    itself; what an :class:`Estimator` is to find is how far an observed one is from it.
+    Returns:
+        Nine recorded and nine smoothed positions, [R, 9, 2] in m, and the motion at the last one,
+        [R, 7]. The motion ends with the smoothed place itself; what an :class:`Estimator` is to
+        find is how far an observed one is from it.
     """
     raw = []
     smooth = []
@@ -265,6 +268,7 @@ def _tracks(scenes: Sequence[SmoothScene]) -> tuple[Tensor, Tensor, Tensor]:
             # Every 0.2 s, from the ninth position on.
             first = rows[0] + OBSERVED_POSITIONS - 1
             for last in range(first, rows[-1] + 1, 2):
+                # The frames of one driver.
                 nine = slice(last - OBSERVED_POSITIONS + 1, last + 1), track
                 raw.append(np.stack((scene.raw_x[nine], scene.raw_y[nine]), -1))
                 smooth.append(np.stack((scene.x[nine], scene.y[nine]), -1))

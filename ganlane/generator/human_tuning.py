@@ -303,8 +303,9 @@ def _values(critic: nn.Module, features: Tensor, sides: Tensor) -> Tensor:
 def advantages(decisions: Decisions) -> tuple[Tensor, Tensor]:
     """Advantages, and values for the critic to learn, [T, N, M].
 
-    Generalised advantage estimation (Schulman et al. 2016, equation 16): the value of a decision is
-    what it was taken for, and by how much the rewards that followed were better.
+    Generalised advantage estimation (Schulman et al. 2016, equation 16). An advantage is by how
+    much the rewards that followed a decision were better than the critic had expected; the value to
+    learn is this expectation and the advantage together.
     """
     reward = -decisions.cost
     value = decisions.value
@@ -496,6 +497,7 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
 
 def _drawn(chances: Tensor, random: torch.Generator) -> Tensor:
     """Numbers [N, M] below K, drawn by their ``chances`` [N, M, K]."""
+    # multinomial takes rows [N * M, K].
     drawn = torch.multinomial(chances.flatten(0, 1), 1, generator=random)
     return drawn.view(chances.shape[:-1])
 

@@ -342,8 +342,8 @@ def cuts(scenes: Sequence[SmoothScene], decisions: int, stride: int) -> list[Cut
     stretches = []
     for scene in scenes:
         # A stretch may end after its scene, which has three more moves at least if it is that long.
-        starts = max(1, len(scene.x) - STEPS * 3)
-        for start in range(0, starts, stride):
+        end = max(1, len(scene.x) - STEPS * 3)
+        for start in range(0, end, stride):
             who = scene.present[start : start + present_frames].any(0)
             if who.any():
                 stretches.append(Cut(scene, start - HISTORY, frames, np.flatnonzero(who)))

@@ -23,17 +23,30 @@ _LIBRARY.define("linear(Tensor x, Tensor weight, Tensor? bias, bool relu) -> Ten
 
 
 @torch.library.impl(_LIBRARY, "linear", "CPU")
-def _operator(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
+def _operator(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    relu: bool,
+) -> Tensor:
+    """What the operator computes; the arguments are those of :func:`matrix_product`."""
     if ONEDNN:
-        return torch.ops.mkldnn._linear_pointwise(
-            x, weight, bias, "relu" if relu else "none", [], ""
-        )
+        after = "relu" if relu else "none"
+        # A ReLU has neither numbers nor an algorithm, which other functions would need here.
+        return torch.ops.mkldnn._linear_pointwise(x, weight, bias, after, [], "")
+
     product = functional.linear(x, weight, bias)
     return torch.relu(product) if relu else product
 
 
 @torch.library.register_fake("ganlane::linear")
-def _shape(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
+def _shape(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    relu: bool,
+) -> Tensor:
+    """An empty result, from which a compiler learns shape and type without computing."""
     return x.new_empty((*x.shape[:-1], weight.shape[0]))
 
 
@@ -43,21 +56,45 @@ def has_fast_product(x: Tensor) -> bool:
 
 
 def matrix_product(
-    x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    relu: bool = False,
 ) -> Tensor:
-    """:func:`linear` in float32 on a CPU, without a gradient, in eager and in compiled graphs."""
+    """:func:`linear` in float32 on a CPU, without a gradient, in eager and in compiled graphs.
+
+    Args:
+        x: inputs, [..., I].
+        weight: [O, I].
+        bias: [O]; None: of zeros.
+        relu: whether a ReLU follows.
+    """
     return torch.ops.ganlane.linear(x, weight, bias, relu)
 
 
-def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tensor:
+def linear(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    relu: bool = False,
+) -> Tensor:
     """``x @ weight.T + bias``, then a ReLU if asked for, with gradients.
 
-    ``x`` is [..., I], ``weight`` [O, I] and ``bias`` [O]; by oneDNN where ``x`` has two dimensions.
+    By oneDNN where ``x`` is float32 on a CPU and has two dimensions.
+
+    Args:
+        x: inputs, [..., I].
+        weight: [O, I].
+        bias: [O].
+        relu: whether a ReLU follows.
     """
-    fast = has_fast_product(x) and x.dim() == 2
-    if fast and not torch.is_grad_enabled():
+    if not has_fast_product(x) or x.dim() != 2:
+        product = functional.linear(x, weight, bias)
+    elif torch.is_grad_enabled():
+        product = _OneDnnLinear.apply(x, weight, bias)
+    else:
+        # The ReLU in one pass with the product.
         return matrix_product(x, weight, bias, relu)
-    product = _OneDnnLinear.apply(x, weight, bias) if fast else functional.linear(x, weight, bias)
     return torch.relu(product) if relu else product
 
 
@@ -66,11 +103,20 @@ class _OneDnnLinear(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """The product [B, O] of inputs [B, I]."""
         ctx.save_for_backward(x, weight)
         return matrix_product(x, weight, bias)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
-        (gradient,), (x, weight) = gradients, ctx.saved_tensors
-        to_x = matrix_product(gradient, weight.t()) if ctx.needs_input_grad[0] else None
-        return to_x, matrix_product(gradient.t(), x.t()), gradient.sum(0)
+        """Gradients of inputs, weight and bias, from that of the product [B, O]."""
+        (gradient,) = gradients
+        x, weight = ctx.saved_tensors
+
+        # The first layer's inputs are data and need none: that saves a product.
+        to_x = None
+        if ctx.needs_input_grad[0]:
+            to_x = matrix_product(gradient, weight.t())
+        to_weight = matrix_product(gradient.t(), x.t())
+        to_bias = gradient.sum(0)
+        return to_x, to_weight, to_bias

@@ -56,8 +56,10 @@ class FitResult:
     ) -> None:
         """Write weights and metadata, atomically.
 
-        ``folds`` are the scores of :func:`ganlane.generator.cross_validate`, if it was called;
-        ``code`` the code's version in more detail than the package's number.
+        Args:
+            path: of the file.
+            folds: scores of :func:`ganlane.generator.cross_validate`, if it was called.
+            code: the code's version in more detail than the package's number.
         """
         fit = {"updates": self.updates, "seconds": round(self.seconds, 1)}
         # Plain data only: reading a file of weights never executes code.
@@ -80,8 +82,11 @@ def load_generator(
 ) -> tuple[Generator, dict[str, Any]]:
     """A generator in evaluation mode, without gradients, and its metadata.
 
-    The metadata are as :meth:`FitResult.save` wrote them. ``preset`` is the required one; None
-    accepts any.
+    The metadata are as :meth:`FitResult.save` wrote them.
+
+    Args:
+        path: of a file that :meth:`FitResult.save` wrote.
+        preset: that is required; None: any.
 
     Raises:
         UserError: no such file, another kind of file, another preset, or weights that do not fit
@@ -104,7 +109,10 @@ def load_human(path: str | Path) -> tuple[HumanModel, dict[str, Any]]:
 
 
 def with_weights(
-    kind: Callable[[Any], Network], sizes: Any, weights: Mapping[str, Any], path: object = "weights"
+    kind: Callable[[Any], Network],
+    sizes: Any,
+    weights: Mapping[str, Any],
+    path: object = "weights",
 ) -> Network:
     """A network with these tensors or arrays, in evaluation mode, without gradients.
 

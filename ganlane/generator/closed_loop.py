@@ -64,9 +64,10 @@ _SCATTER = 0.25
 class History(NamedTuple):
     """Past motions of [N, M] vehicles.
 
-    ``motions`` are observed - 1 tensors [N, M, 4H], input projections of the last motions, oldest
-    first; separate ones, because a single one would be copied whole at every step. ``displacement``
-    [N, M, 2] is the newest motion's, m per 0.1 s.
+    Attributes:
+        motions: observed - 1 tensors [N, M, 4H], input projections of the last motions, oldest
+            first; separate ones, because a single one would be copied whole at every step.
+        displacement: the newest motion's, [N, M, 2], m per 0.1 s.
     """
 
     motions: tuple[Tensor, ...]
@@ -94,15 +95,35 @@ def recorded(generator: Generator, displacements: Tensor) -> History:
 def push(generator: Generator, history: History, displacement: Tensor) -> tuple[History, Tensor]:
     """The history with the new motion, and its difference [N, M, 2] to the last one, m."""
     difference = displacement - history.displacement
+
     # Only the new motion is projected; those of the older ones are kept.
     new = generator.encoder.project(displacement, difference)
-    return History((*history.motions[1:], new), displacement), difference
+    motions = (*history.motions[1:], new)
+    return History(motions, displacement), difference
 
 
-def observe(history: History, difference: Tensor, vehicles: Vehicles, extra: Tensor) -> Observation:
-    """The generator's input after :func:`push`."""
-    position = torch.stack([vehicles.x, vehicles.y], dim=-1)
-    return Observation(*history, difference, position, vehicles.valid, extra)
+def observe(
+    history: History,
+    difference: Tensor,
+    vehicles: Vehicles,
+    extra: Tensor,
+) -> Observation:
+    """The generator's input after :func:`push`.
+
+    Args:
+        history: with the newest motion.
+        difference: of this motion to the one before, [N, M, 2], m.
+        vehicles: now, [N, M].
+        extra: further inputs, [N, M, extra_inputs].
+    """
+    return Observation(
+        projections=history.motions,
+        displacement=history.displacement,
+        difference=difference,
+        position=torch.stack([vehicles.x, vehicles.y], dim=-1),
+        valid=vehicles.valid,
+        extra=extra,
+    )
 
 
 def displacement_of(vehicles: Vehicles) -> Tensor:
@@ -112,59 +133,86 @@ def displacement_of(vehicles: Vehicles) -> Tensor:
     after 5 km.
     """
     length = vehicles.speed * PHYSICS_STEP_S
-    heading = vehicles.heading
-    return torch.stack([length * torch.cos(heading), length * torch.sin(heading)], dim=-1)
+    along = length * torch.cos(vehicles.heading)
+    across = length * torch.sin(vehicles.heading)
+    return torch.stack([along, across], dim=-1)
 
 
 def moved_by(vehicles: Vehicles, velocity_x: Tensor, velocity_y: Tensor) -> Vehicles:
-    """The vehicles 0.1 s later at a new velocity (m/s, [N, M]).
+    """The vehicles 0.1 s later at a new velocity.
 
     Nobody drives backwards or slides sideways: the lateral velocity is limited to :data:`STEEPEST`
     times the longitudinal one, so a standing car stays in place.
+
+    Args:
+        vehicles: now, [N, M].
+        velocity_x: along the road, m/s, [N, M].
+        velocity_y: across the road, m/s, [N, M].
     """
     forward = velocity_x.clamp_min(0.0)
     limit = STEEPEST * forward
-    lateral = torch.maximum(torch.minimum(velocity_y, limit), -limit)
+    lateral = torch.minimum(velocity_y, limit)
+    lateral = torch.maximum(lateral, -limit)
+
     # The small terms keep the gradient at a speed of 0 finite.
     speed = torch.sqrt(forward * forward + lateral * lateral + 1e-6 * 1e-6)
+    tangent = lateral / forward.clamp_min(1e-3)
     return vehicles.with_(
         x=vehicles.x + forward * PHYSICS_STEP_S,
         y=vehicles.y + lateral * PHYSICS_STEP_S,
         speed=speed,
-        heading=torch.atan(lateral / forward.clamp_min(1e-3)),
+        heading=torch.atan(tangent),
         acceleration=(speed - vehicles.speed) / PHYSICS_STEP_S,
     )
 
 
 def wander(noise: Tensor, fresh: Tensor, period_s: float) -> Tensor:
-    """``noise`` 0.1 s later, of unit variance and with the time constant ``period_s``.
+    """The latent vectors 0.1 s later, of unit variance.
 
-    ``fresh`` are independent standard normal numbers of the same shape. A period of 0 draws anew at
-    every step.
+    Args:
+        noise: the vectors now.
+        fresh: independent standard normal numbers of the same shape.
+        period_s: time constant, s; 0 draws anew at every step.
     """
     # An Ornstein-Uhlenbeck process, solved exactly: what stays, and what makes up the variance.
-    share = math.exp(-PHYSICS_STEP_S / period_s) if period_s > 0 else 0.0
+    share = 0.0
+    if period_s > 0:
+        share = math.exp(-PHYSICS_STEP_S / period_s)
     return share * noise + math.sqrt(1.0 - share * share) * fresh
 
 
 def paper_step(
-    generator: Generator, vehicles: Vehicles, history: History, noise: Tensor
+    generator: Generator,
+    vehicles: Vehicles,
+    history: History,
+    noise: Tensor,
 ) -> tuple[Vehicles, History]:
     """One step of the paper's preset: vehicles 0.1 s later, and their history.
 
     One decoder step is run and driven.
+
+    Args:
+        generator: of the paper's preset.
+        vehicles: now, [N, M].
+        history: their motions before the last one, which follows from speed and heading.
+        noise: latent vectors [N, M, Z].
     """
     history, difference = push(generator, history, displacement_of(vehicles))
     # The paper's preset has positions only: further inputs of width 0.
     observation = observe(history, difference, vehicles, difference[..., :0])
-    velocity = generator(observation, noise, 1)[..., 0, :] / PHYSICS_STEP_S
-    return moved_by(vehicles, velocity[..., 0], velocity[..., 1]), history
+
+    displacement = generator(observation, noise, steps=1)[..., 0, :]
+    velocity_x, velocity_y = (displacement / PHYSICS_STEP_S).unbind(-1)
+    return moved_by(vehicles, velocity_x, velocity_y), history
 
 
 class DriverMemory(NamedTuple):
     """State of the calibrated preset.
 
-    History, the residual's mean [N, M, 2] in m/s2, and the headway [N, M] in s.
+    Attributes:
+        history: past motions.
+        mean: of the residual, exponential over the washout, [N, M, 2], m/s2.
+        headway: the driver's own, [N, M], s.
     """
 
     history: History
@@ -175,10 +223,13 @@ class DriverMemory(NamedTuple):
 def extra_inputs(scene: Scene, anchor: Tensor, offset: Tensor) -> Tensor:
     """The further inputs [N, M, 4], each bounded and of order 1.
 
-    Without a leader the gap input is 1. ``anchor`` is IDM's acceleration, m/s2, ``offset`` the
-    distance to the target lane's centre, m.
+    Args:
+        scene: vehicles and their neighbours.
+        anchor: IDM's acceleration, m/s2, [N, M].
+        offset: distance to the target lane's centre, m, [N, M].
     """
     ahead = leader(scene, scene.vehicles.target_lane.to(anchor.dtype))
+    # Without a leader, the gap is so large that its input is 1.
     gap = ahead.gap.clamp_min(0.0)
     closing = (scene.vehicles.speed - ahead.speed) / 5.0
     columns = [
@@ -192,18 +243,30 @@ def extra_inputs(scene: Scene, anchor: Tensor, offset: Tensor) -> Tensor:
 
 
 def inside_lane(
-    residual: Tensor, offset: Tensor, velocity: Tensor, room: Tensor, damping: float
+    residual: Tensor,
+    offset: Tensor,
+    velocity: Tensor,
+    room: Tensor,
+    damping: float,
 ) -> Tensor:
-    """Lateral ``residual`` [N, M] in m/s2 without what would move the body out of its lane.
+    """The lateral residual [N, M], m/s2, without what would move the body out of its lane.
 
     Outward residuals fade to 0 over :data:`_FADE_M` before the point at which the vehicle, left
     alone, would come to rest ``room`` off the lane's centre: damping alone carries it another
-    ``velocity / damping``. ``offset`` is the distance to the target lane's centre, m.
+    ``velocity / damping``.
+
+    Args:
+        residual: the network's, across the road, m/s2, [N, M].
+        offset: distance to the target lane's centre, m, [N, M].
+        velocity: across the road, m/s, [N, M].
+        room: between the body, in the centre, and the lane's edge, m, [N, M].
+        damping: of the anchor, 1/s.
     """
     # Where it comes to rest, from the lane's centre; then the same in the residual's direction.
     rest = velocity / damping - offset
     outwards = torch.where(residual > 0, rest, -rest)
-    return residual * ((room - outwards) / _FADE_M).clamp(0.0, 1.0)
+    share = ((room - outwards) / _FADE_M).clamp(0.0, 1.0)
+    return residual * share
 
 
 def anchored_step(
@@ -217,22 +280,30 @@ def anchored_step(
 ) -> tuple[Vehicles, DriverMemory]:
     """One step of the calibrated preset: vehicles [N, M] 0.1 s later and their new memory.
 
-    The vehicles' ``target_lane`` is the lane to keep or to change to, ``desired_speed`` the
-    driver's own; ``road`` is one per row in recorded scenes; latent vectors ``noise`` [N, M, Z] of
-    zeros give the mean driver. The anchor accelerates with no more than ``bound`` [N, M], m/s2.
+    Args:
+        generator: of the calibrated preset.
+        vehicles: now; their ``target_lane`` is the lane to keep or to change to, ``desired_speed``
+            the driver's own.
+        road: that they are on; one per row in recorded scenes.
+        memory: of the drivers.
+        noise: latent vectors [N, M, Z]; zeros give the mean driver.
+        parameters: of the anchor.
+        bound: the anchor accelerates with no more than this, [N, M], m/s2.
     """
     p = parameters
     displacement = displacement_of(vehicles)
     history, difference = push(generator, memory.history, displacement)
+    velocity_x, velocity_y = (displacement / PHYSICS_STEP_S).unbind(-1)
 
-    # The anchor: IDM along the road; a spring and a damper to the target lane's centre across it.
+    # The anchor along the road: IDM.
     scene = perceive(vehicles, road)
     anchor_x = following_acceleration(scene, with_headways(p.idm, memory.headway))
     if bound is not None:
         anchor_x = torch.minimum(anchor_x, bound(scene))
+
+    # Across it: a spring and a damper to the target lane's centre.
     offset = road.centre_of(vehicles.target_lane, vehicles.y.dtype) - vehicles.y
-    velocity = displacement / PHYSICS_STEP_S
-    anchor_y = p.lane_stiffness * offset - p.lane_damping * velocity[..., 1]
+    anchor_y = p.lane_stiffness * offset - p.lane_damping * velocity_y
 
     # The network's residual, in m/s2. The decoder's first output is enough: each step decides anew.
     extra = extra_inputs(scene, anchor_x, offset)
@@ -246,32 +317,41 @@ def anchored_step(
 
     # The washout: without its mean, the residual cannot hold a speed or an offset of its own.
     mean = memory.mean + (PHYSICS_STEP_S / p.washout_s) * (residual - memory.mean)
-    residual = residual - mean
+    residual_x, residual_y = (residual - mean).unbind(-1)
     room = 0.5 * (road.lane_width_m - vehicles.width) - _MARGIN_M
-    residual_y = inside_lane(residual[..., 1], offset, velocity[..., 1], room, p.lane_damping)
+    residual_y = inside_lane(residual_y, offset, velocity_y, room, p.lane_damping)
 
-    velocity_x = velocity[..., 0] + (anchor_x + residual[..., 0]) * PHYSICS_STEP_S
-    velocity_y = velocity[..., 1] + (anchor_y + residual_y) * PHYSICS_STEP_S
-    return moved_by(vehicles, velocity_x, velocity_y), DriverMemory(history, mean, memory.headway)
+    # 0.1 s of both accelerations.
+    velocity_x = velocity_x + (anchor_x + residual_x) * PHYSICS_STEP_S
+    velocity_y = velocity_y + (anchor_y + residual_y) * PHYSICS_STEP_S
+    memory = DriverMemory(history, mean, memory.headway)
+    return moved_by(vehicles, velocity_x, velocity_y), memory
 
 
 def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> Vehicles:
-    """The recorded vehicles [B, V] at ``frame`` (1 or later).
+    """The recorded vehicles [B, V].
 
     Their velocity is that of the last displacement. Each occupies the lane of its centre only, with
     a small width: recorded lanes are narrow and straightened to some decimetres, so by its body one
     vehicle in ten would occupy two lanes and make others brake.
+
+    Args:
+        segments: B segments of V vehicles.
+        frame: 1 or later.
+        desired_speed: of the drivers, m/s, [B, V].
     """
     position = segments.positions[:, frame]
     target = segments.target_lane[:, frame]
+    x, y = position.unbind(-1)
+
     # Finite at a vehicle's first frame, too: before it, positions go on at constant velocity.
     velocity = (position - segments.positions[:, frame - 1]) / PHYSICS_STEP_S
-    x, y = position.unbind(-1)
+    # The bound keeps the angle of a standing vehicle small, where positions are noise.
+    tangent = velocity[..., 1] / velocity[..., 0].clamp_min(0.1)
     return Vehicles(
         x=x,
         y=y,
-        # The bound keeps the angle of a standing vehicle small, where positions are noise.
-        heading=torch.atan(velocity[..., 1] / velocity[..., 0].clamp_min(0.1)),
+        heading=torch.atan(tangent),
         speed=torch.sqrt((velocity * velocity).sum(-1)),
         acceleration=torch.zeros_like(x),
         length=segments.length,
@@ -286,22 +366,29 @@ def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> 
 def driven_positions(
     segments: Segments, desired_speed: Tensor, move: Callable[[Vehicles, int], Vehicles]
 ) -> Tensor:
-    """Positions [B, H, V, 2] in m when ``move`` drives all vehicles of the segments jointly.
+    """Positions [B, H, V, 2] in m when all vehicles of the segments are driven jointly.
 
-    It drives them for the H steps after the observed frames, and takes the vehicles now and the
-    step's number to the vehicles 0.1 s later. A vehicle that appears later starts at its first
-    recorded position with the velocity of its first displacement. A vehicle is removed at the frame
-    where its recording ends.
+    A vehicle that appears later starts at its first recorded position with the velocity of its
+    first displacement. A vehicle is removed at the frame where its recording ends.
+
+    Args:
+        segments: 9 observed frames and H more of V vehicles.
+        desired_speed: of the drivers, m/s, [B, V].
+        move: takes the vehicles now and the step's number, from 0 to H - 1, to the vehicles 0.1 s
+            later.
     """
     vehicles = recorded_vehicles(segments, PRESENT, desired_speed)
     appeared = segments.present.cumsum(dim=1) > 0
+
     positions = []
     for step in range(segments.positions.shape[1] - OBSERVED_POSITIONS):
         frame = PRESENT + step
         moved = move(vehicles, step)
+
         # Who has not appeared yet goes on as recorded: at constant velocity, up to its first frame.
         entering = recorded_vehicles(segments, frame + 1, desired_speed)
         vehicles = moved.where(appeared[:, frame], entering)
+
         # Who is recorded, and in which lane it wants to be, follows the recording at every step.
         vehicles = vehicles.with_(valid=entering.valid, target_lane=entering.target_lane)
         positions.append(torch.stack([vehicles.x, vehicles.y], dim=-1))
@@ -309,7 +396,7 @@ def driven_positions(
 
 
 def noise_shape(generator: Generator, segments: Segments, samples: int) -> tuple[int, ...]:
-    """Of the numbers that :func:`rollout` takes for so many samples."""
+    """Shape [1 + H, K, B, V, Z] of the numbers that :func:`rollout` takes for K ``samples``."""
     steps = 1 + segments.future.shape[1]
     return (steps, samples, *segments.length.shape, generator.sizes.noise)
 
@@ -323,21 +410,30 @@ def rollout(
 ) -> Tensor:
     """Positions [K, B, H, V, 2] in m of K joint rollouts by the calibrated preset.
 
-    See :func:`driven_positions`. ``drivers`` are the headways in s and desired speeds in m/s, [B,
-    V] each; ``noise`` [1 + H, K, B, V, Z] the latent vectors at the start, then the numbers that
-    change them (:func:`wander`).
+    See :func:`driven_positions`.
+
+    Args:
+        generator: of the calibrated preset.
+        segments: B of them, of H steps and V vehicles.
+        drivers: their headways, s, and desired speeds, m/s, [B, V] each.
+        noise: [1 + H, K, B, V, Z], the latent vectors at the start, then the numbers that change
+            them (:func:`wander`).
+        config: how fast they change.
     """
-    # The samples are further rows of the batch.
+    # The samples are further rows of the batch: N = K * B.
     samples = noise.shape[1]
     segments = segments.repeated(samples)
     road = segments.road
-    headway, desired_speed = (values.repeat(samples, 1) for values in drivers)
+    headway, desired_speed = drivers
+    headway = headway.repeat(samples, 1)
+    desired_speed = desired_speed.repeat(samples, 1)
     latent, *fresh = noise.flatten(1, 2)
 
     # The first step pushes the last observed displacement, so the history ends one before it.
     past = segments.positions[:, :OBSERVED_POSITIONS].diff(dim=1).transpose(1, 2)
     history = recorded(generator, past[..., :-1, :])
-    memory = DriverMemory(history, torch.zeros_like(past[..., 0, :]), headway)
+    no_mean = torch.zeros_like(past[..., 0, :])
+    memory = DriverMemory(history, no_mean, headway)
 
     def move(vehicles: Vehicles, step: int) -> Vehicles:
         nonlocal memory, latent
@@ -345,36 +441,49 @@ def rollout(
         latent = wander(latent, fresh[step], config.noise_period_s)
         return moved
 
-    return driven_positions(segments, desired_speed, move).unflatten(0, (samples, -1))
+    positions = driven_positions(segments, desired_speed, move)
+    return positions.unflatten(0, (samples, -1))
 
 
 def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUANTILES_S) -> Tensor:
-    """Headways in s whose quantiles are ``quantiles_s``, from uniform numbers ``u``.
+    """Headways in s, linear between their quantiles, flat beyond the outer ones.
 
-    Linear between the quantiles, flat beyond the outer ones.
+    Args:
+        u: uniform numbers of any shape.
+        quantiles_s: headways at the levels ``QUANTILE_LEVELS``, s.
     """
     values = constant(quantiles_s, u)
     levels = constant(QUANTILE_LEVELS, u)
+
     # The pair of quantiles around u; the outer pairs serve for what is beyond them.
     upper = torch.searchsorted(levels, u.contiguous()).clamp(1, len(QUANTILE_LEVELS) - 1)
-    low = levels[upper - 1]
-    high = levels[upper]
-    part = ((u - low) / (high - low)).clamp(0.0, 1.0)
-    return values[upper - 1] + part * (values[upper] - values[upper - 1])
+    lower = upper - 1
+    part = (u - levels[lower]) / (levels[upper] - levels[lower])
+    return values[lower] + part.clamp(0.0, 1.0) * (values[upper] - values[lower])
 
 
 def balanced_headway(vehicles: Vehicles, road: Road, otherwise: Tensor) -> Tensor:
     """The headway [N, M] in s at which IDM neither speeds up nor brakes now.
 
     It follows from gap, speed and desired speed. For vehicles without a leader, or further behind
-    it than the largest quantile, it is unknown: ``otherwise``.
+    it than the largest quantile, it is unknown.
+
+    Args:
+        vehicles: now, [N, M].
+        road: that they are on.
+        otherwise: the headway where it is unknown, s, [N, M].
     """
-    ahead = leader(perceive(vehicles, road), vehicles.target_lane.to(vehicles.x.dtype))
-    # IDM's equation for an acceleration of 0 at the leader's speed, solved for the headway.
+    target_lane = vehicles.target_lane.to(vehicles.x.dtype)
+    ahead = leader(perceive(vehicles, road), target_lane)
+
+    # IDM's equation for an acceleration of 0 at the leader's speed, solved for the headway:
+    # gap * sqrt(1 - (v / v0)^4) = s0 + v T. Products in place of a power, whose last bits may
+    # differ between batch sizes.
     ratio = vehicles.speed / vehicles.desired_speed
-    # Products in place of a power, whose last bits may differ between batch sizes.
-    settled = ahead.gap * torch.sqrt((1.0 - ratio * ratio * ratio * ratio).clamp_min(0.0))
+    free_share = (1.0 - ratio * ratio * ratio * ratio).clamp_min(0.0)
+    settled = ahead.gap * torch.sqrt(free_share)
     headway = (settled - TABLE_V.min_gap_m) / vehicles.speed.clamp_min(1.0)
+
     follows = (ahead.gap < FREE_GAP_M) & (headway <= HEADWAY_QUANTILES_S[-1])
     return torch.where(follows, headway.clamp_min(SHORTEST_HEADWAY_S), otherwise)
 
@@ -384,23 +493,29 @@ def driver_params(
 ) -> tuple[Tensor, Tensor]:
     """Headways in s and desired speeds in m/s of the drivers, [B, V] each.
 
-    With ``random``, for fitting: random ones, about the balanced headways and above the present
-    speeds, since in congestion the recordings do not show the desired speeds. Without it, for
-    evaluation: the balanced headway or the median one, and the middle desired speed.
+    Args:
+        segments: B of them, with the present of V vehicles.
+        random: for fitting: draws them about the balanced headways and above the present speeds,
+            since in congestion the recordings do not show the desired speeds. None, for evaluation:
+            the balanced headway or the median one, and the middle desired speed.
     """
     low, high = DESIRED_EXCESS_MPS
     shape = segments.length.shape
     one = torch.ones_like(segments.length)
     # Desired speeds are not known yet: 1 m/s holds their place.
     now = recorded_vehicles(segments, PRESENT, one)
+
     if random is None:
+        median_s = HEADWAY_QUANTILES_S[len(HEADWAY_QUANTILES_S) // 2]
+        otherwise = one * median_s
         scatter = one
-        otherwise = one * HEADWAY_QUANTILES_S[len(HEADWAY_QUANTILES_S) // 2]
         desired = now.speed + 0.5 * (low + high)
     else:
         excess, level = torch.rand(2, *shape, generator=random)
-        scatter = torch.exp(_SCATTER * torch.randn(shape, generator=random))
         otherwise = headway_from_uniform(level)
+        scatter = torch.exp(_SCATTER * torch.randn(shape, generator=random))
         desired = now.speed + low + (high - low) * excess
-    headway = balanced_headway(now.with_(desired_speed=desired), segments.road, otherwise)
+
+    now = now.with_(desired_speed=desired)
+    headway = balanced_headway(now, segments.road, otherwise)
     return headway * scatter, desired

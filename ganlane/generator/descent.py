@@ -13,7 +13,10 @@ def descend(
 ) -> float:
     """One step down the ``loss``, whose value is returned.
 
-    The gradient of the optimizer's first group is clipped to this norm.
+    Args:
+        optimizer: of the parameters that the loss depends on.
+        loss: a number.
+        largest_gradient: norm to which the gradient of the optimizer's first group is clipped.
     """
     optimizer.zero_grad()
     loss.backward()
@@ -24,5 +27,10 @@ def descend(
 
 
 def half_cosine(update: int, updates: int) -> float:
-    """Share of the learning rate at an ``update``: from 1 down to 0."""
+    """Share of the learning rate, from 1 at the first update down to 0 after the last one.
+
+    Args:
+        update: its number, from 0 on.
+        updates: how many there are.
+    """
     return 0.5 * (1.0 + math.cos(math.pi * update / updates))

@@ -52,6 +52,7 @@ Forecasts = dict[str, np.ndarray]
 Driver = Callable[[Segments], Tensor]
 #: Scores as plain data, for JSON and tables.
 Row = dict[str, Any]
+
 # What goes through a network in one pass; bounds the memory.
 #: Groups of windows.
 _GROUPS = 128
@@ -64,28 +65,38 @@ _SEGMENTS = 16
 def distance(one: Tensor, other: Tensor) -> Tensor:
     """Euclidean distance [...] between positions [..., 2], with a finite gradient at distance 0."""
     apart = one - other
-    return torch.sqrt((apart * apart).sum(-1) + _SMALLEST_DISTANCE_M * _SMALLEST_DISTANCE_M)
+    squared = (apart * apart).sum(-1)
+    return torch.sqrt(squared + _SMALLEST_DISTANCE_M * _SMALLEST_DISTANCE_M)
 
 
 def errors_of(forecasts: Forecasts, recorded: np.ndarray) -> Forecasts:
     """Distances [W, T] in m of every forecast [W, T, 2] to the recording."""
-    return {
-        name: np.linalg.norm(positions - recorded, axis=-1) for name, positions in forecasts.items()
-    }
+    errors = {}
+    for name, positions in forecasts.items():
+        errors[name] = np.linalg.norm(positions - recorded, axis=-1)
+    return errors
 
 
 def displacement_errors(errors: Forecasts, rows: np.ndarray | None = None) -> Row:
-    """ADE and FDE in m of every forecast over the chosen windows.
+    """ADE and FDE in m of every forecast, and the ADE's change to the baseline's in %.
 
-    The ADE's change to the baseline's is added, in %.
+    Args:
+        errors: of the forecasts, :data:`BASELINE` among them, [W, T] in m.
+        rows: an index or a mask of the windows that count; None: all.
+
+    Returns:
+        ``windows`` (how many), and by the forecasts' names ``ade_m``, ``fde_m`` and
+        ``ade_change_percent``.
     """
     # The same windows for all kinds, so that their errors can be compared.
     if rows is not None:
         errors = {name: values[rows] for name, values in errors.items()}
     ade = {name: float(values.mean()) for name, values in errors.items()}
     fde = {name: float(values[:, -1].mean()) for name, values in errors.items()}
+
     # Relative to constant velocity, since recordings differ in how hard they are to predict.
-    change = {name: 100.0 * (value / ade[BASELINE] - 1.0) for name, value in ade.items()}
+    baseline = ade[BASELINE]
+    change = {name: 100.0 * (value / baseline - 1.0) for name, value in ade.items()}
     return {
         "windows": len(errors[BASELINE]),
         "ade_m": ade,
@@ -95,41 +106,69 @@ def displacement_errors(errors: Forecasts, rows: np.ndarray | None = None) -> Ro
 
 
 def long_errors(errors: Forecasts) -> Row:
-    """RMSE in m after each whole second of every forecast; at the end, over constant velocity's."""
+    """RMSE in m of every forecast after each whole second, and over constant velocity's at the end.
+
+    Args:
+        errors: of the forecasts, :data:`BASELINE` among them, [W, T] in m; T is 10 or more.
+
+    Returns:
+        ``windows`` (how many), and by the forecasts' names ``rmse_m`` (by ``"1 s"``, ``"2 s"`` and
+        so on) and ``ratio_to_constant_velocity``.
+    """
     # Steps are 0.1 s apart, so index 9 is the first whole second.
-    rmse = {name: np.sqrt((values[:, 9::10] ** 2).mean(0)) for name, values in errors.items()}
+    rmse = {}
+    for name, values in errors.items():
+        squared = values[:, 9::10] ** 2
+        rmse[name] = np.sqrt(squared.mean(0))
+
+    by_second: dict[str, dict[str, float]] = {}
+    ratios = {}
+    for name, values in rmse.items():
+        by_second[name] = {}
+        for second, value in enumerate(values, start=1):
+            by_second[name][f"{second} s"] = float(value)
+        ratios[name] = float(values[-1] / rmse[BASELINE][-1])
     return {
         "windows": len(errors[BASELINE]),
-        "rmse_m": {
-            name: {f"{second} s": float(value) for second, value in enumerate(values, start=1)}
-            for name, values in rmse.items()
-        },
-        "ratio_to_constant_velocity": {
-            name: float(values[-1] / rmse[BASELINE][-1]) for name, values in rmse.items()
-        },
+        "rmse_m": by_second,
+        "ratio_to_constant_velocity": ratios,
     }
 
 
 def by_kind(samples: np.ndarray, recorded: np.ndarray) -> Forecasts:
-    """The kinds of forecasts in samples [1 + K, W, T, 2], of which the first has z = 0.
+    """The kinds of forecasts of a generator: ``mean``, ``single`` and, of 20 samples or more,
+    ``best_of_20`` (by ADE).
 
-    ``mean``, ``single`` and, of 20 samples or more, ``best_of_20`` (by ADE).
+    Args:
+        samples: forecasts [1 + K, W, T, 2] in m, of which the first has z = 0.
+        recorded: what they forecast, [W, T, 2] in m.
     """
     kinds = dict(zip(("mean", "single"), samples))
     if len(samples) > SAMPLES:
-        # The best one is chosen per window, by its mean over the steps.
-        errors = np.linalg.norm(samples[1:] - recorded, axis=-1).mean(-1)
-        kinds[f"best_of_{SAMPLES}"] = samples[1:][errors.argmin(0), np.arange(len(recorded))]
+        # The best one is chosen per window, by its mean over the steps: [K, W].
+        drawn = samples[1:]
+        ade = np.linalg.norm(drawn - recorded, axis=-1).mean(-1)
+        best = ade.argmin(0)
+        kinds[f"best_of_{SAMPLES}"] = drawn[best, np.arange(len(recorded))]
     return kinds
 
 
 @torch.no_grad()
 def paper_forecasts(
-    generator: Generator, windows: Windows, groups: Groups, seed: int, samples: int
+    generator: Generator,
+    windows: Windows,
+    groups: Groups,
+    seed: int,
+    samples: int,
 ) -> np.ndarray:
-    """Forecasts [1 + K, W, T, 2] by the paper's preset, open loop, on the windows in ``groups``.
+    """Forecasts [1 + K, W, T, 2] by the paper's preset, open loop; the first has z = 0.
 
-    The first has z = 0, the K = ``samples`` others are drawn.
+    Args:
+        generator: of the paper's preset.
+        windows: W windows.
+        groups: these windows in groups (:func:`~ganlane.generator.windows.group_windows`).
+        seed: of the latent vectors.
+        samples: K, the forecasts that are drawn.
     """
     random = torch.Generator().manual_seed(seed)
     positions = np.empty((1 + samples, *windows.future.shape))
@@ -137,11 +176,15 @@ def paper_forecasts(
         chunk = groups.select(rows)
         past = chunk.displacements[..., : generator.sizes.observed, :]
         observation = generator.observe(past, chunk.position, chunk.mask)
+
         shape = (1 + samples, *chunk.mask.shape, generator.sizes.noise)
         noise = torch.randn(shape, generator=random)
         # The first sample is the mean prediction.
         noise[0] = 0.0
+
+        # Positions are the sums of displacements, [1 + K, B, G, T, 2].
         predicted = generator(observation, noise).cumsum(dim=-2)
+
         # From groups back to the order of the windows.
         row = chunk.window[chunk.mask].numpy()
         positions[:, row] = predicted[:, chunk.mask].double().numpy()
@@ -150,11 +193,22 @@ def paper_forecasts(
 
 @torch.no_grad()
 def driven_windows(
-    driver: Driver, scenes: list[Recording], horizon: int, stride: int, times: int = 1
+    driver: Driver,
+    scenes: list[Recording],
+    horizon: int,
+    stride: int,
+    times: int = 1,
 ) -> np.ndarray:
-    """Forecasts [K, W, H, 2] by a ``driver`` of K = ``times`` of all windows of 9 + H frames.
+    """Forecasts [K, W, H, 2] in m by a driver, of all windows of 9 + H frames.
 
-    These are of the vehicles recorded throughout a segment; H is the ``horizon``.
+    These are of the vehicles recorded throughout a segment.
+
+    Args:
+        driver: drives the segments.
+        scenes: recordings.
+        horizon: H, the steps that are forecast.
+        stride: frames between the starts of two segments.
+        times: K, how often the driver drives a segment.
     """
     # Each time multiplies the rows, so fewer segments go through in one pass.
     size = max(1, _ROLLOUTS // times)
@@ -163,21 +217,24 @@ def driven_windows(
         for segments in segment_batches(scene, horizon, stride, size):
             present = segments.positions[:, PRESENT, None]
             positions = driver(segments.without_intentions()) - present
-            # A window is a vehicle that is recorded in all frames.
+
+            # A window is a vehicle that is recorded in all frames. [K, B, V, H, 2] -> [K, W, H, 2].
             complete = segments.present.all(dim=1)
-            forecasts.append(positions.transpose(2, 3)[:, complete].double().numpy())
+            of_windows = positions.transpose(2, 3)[:, complete]
+            forecasts.append(of_windows.double().numpy())
     return np.concatenate(forecasts, axis=1)
 
 
 def calibrated_driver(generator: Generator, config: CalibratedConfig, samples: int) -> Driver:
     """The calibrated preset: its mean prediction, then so many samples.
 
-    Drivers are those of the present.
+    Headways and desired speeds are those that drivers show at the present.
     """
     random = torch.Generator().manual_seed(0)
 
     def driver(segments: Segments) -> Tensor:
-        noise = torch.randn(noise_shape(generator, segments, 1 + samples), generator=random)
+        shape = noise_shape(generator, segments, 1 + samples)
+        noise = torch.randn(shape, generator=random)
         noise[:, 0] = 0.0
         return rollout(generator, segments, driver_params(segments), noise, config)
 
@@ -191,10 +248,11 @@ def idm_driver(segments: Segments) -> Tensor:
     anchor.
     """
     headway, desired = driver_params(segments)
+    parameters = with_headways(TABLE_V, headway)
 
     def move(vehicles: Vehicles, step: int) -> Vehicles:
         scene = perceive(vehicles, segments.road)
-        acceleration = following_acceleration(scene, with_headways(TABLE_V, headway))
+        acceleration = following_acceleration(scene, parameters)
         speed = displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S
         velocity = speed + acceleration * PHYSICS_STEP_S
         return moved_by(vehicles, velocity, torch.zeros_like(velocity))
@@ -210,10 +268,16 @@ def repeated(displacement: np.ndarray, steps: int) -> np.ndarray:
 def energy_score(one: Tensor, other: Tensor, recorded: Tensor) -> Tensor:
     """Energy score [...] of two samples: mean error minus half their distance, in m.
 
-    All are positions [..., 2]. A proper score: least in expectation when the samples are drawn from
-    the distribution of the recordings (Gneiting and Raftery 2007).
+    A proper score: least in expectation when the samples are drawn from the distribution of the
+    recordings (Gneiting and Raftery 2007).
+
+    Args:
+        one: a sample's positions, [..., 2] in m.
+        other: those of another sample of the same drivers.
+        recorded: positions, [..., 2] in m.
     """
     mean_error = 0.5 * (distance(one, recorded) + distance(other, recorded))
+    # Two samples that are alike gain nothing from this term: variety pays.
     return mean_error - 0.5 * distance(one, other)
 
 
@@ -225,34 +289,50 @@ def rollout_score(generator: Generator, scenes: list[Recording], config: Calibra
     velocity's error at the same step. Target lanes and driver parameters are those of the present,
     so no information of the future is used. Unlike in forecasts of windows, a vehicle counts for as
     long as it is recorded.
+
+    Args:
+        generator: of the calibrated preset.
+        scenes: recordings that it was not fitted to.
+        config: horizon and stride of the segments, and how fast the noise changes.
     """
     random = torch.Generator().manual_seed(0)
-    horizon = config.held_out_horizon
-    parts: list[tuple[tuple[Tensor, ...], Tensor]] = []
+    # Parts of mean_by_step, of each of the three errors.
+    mean_errors = []
+    energies = []
+    baselines = []
     for scene in scenes:
-        for batch in segment_batches(scene, horizon, config.held_out_stride, _SEGMENTS):
+        cuts = segment_batches(scene, config.held_out_horizon, config.held_out_stride, _SEGMENTS)
+        for batch in cuts:
             segments = batch.without_intentions()
             future = segments.future
+            scored = segments.scored
+
             # Three rollouts at once: the mean prediction, and two samples.
             fresh = torch.randn(noise_shape(generator, segments, 2), generator=random)
             noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
-            mean, one, other = rollout(generator, segments, driver_params(segments), noise, config)
-            errors = (
-                distance(mean, future),
-                energy_score(one, other, future),
-                distance(segments.constant_velocity, future),
-            )
-            parts.append((errors, segments.scored))
-    mean_error, energy, baseline = (
-        mean_by_step([(errors[kind], scored) for errors, scored in parts]) for kind in range(3)
-    )
-    least = baseline.clamp_min(1e-6)
-    return 0.5 * (float((mean_error / least).mean()) + float((energy / least).mean()))
+            drivers = driver_params(segments)
+            mean, one, other = rollout(generator, segments, drivers, noise, config)
+
+            mean_errors.append((distance(mean, future), scored))
+            energies.append((energy_score(one, other, future), scored))
+            baselines.append((distance(segments.constant_velocity, future), scored))
+
+    # Where everybody stands, constant velocity makes no error.
+    baseline = mean_by_step(baselines).clamp_min(1e-6)
+    of_mean = (mean_by_step(mean_errors) / baseline).mean()
+    of_samples = (mean_by_step(energies) / baseline).mean()
+    return 0.5 * (float(of_mean) + float(of_samples))
 
 
 def mean_by_step(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
     """Mean [H] of errors [B, H, V] where their mask [B, H, V] is true, over all parts."""
     # Sums and counts are pooled first, since batches differ in their number of vehicles.
-    count = torch.stack([scored.sum((0, 2)) for _, scored in parts]).sum(0).clamp_min(1)
-    total = torch.stack([(errors * scored).sum((0, 2)) for errors, scored in parts]).sum(0)
-    return total / count
+    counts = []
+    totals = []
+    for errors, scored in parts:
+        counts.append(scored.sum((0, 2)))
+        totals.append((errors * scored).sum((0, 2)))
+
+    # A step at which nobody counts has an error of 0.
+    count = torch.stack(counts).sum(0).clamp_min(1)
+    return torch.stack(totals).sum(0) / count

@@ -57,11 +57,14 @@ STYLE_S = 6.0
 #: Bounds of the acceleration, m/s2.
 HARDEST_BRAKING = -8.0
 STRONGEST_ACCELERATION = 3.5
-#: Lateral speed per speed along the road, and its bound, m/s.
+#: Lateral speed at most, per speed along the road.
 STEEPEST = 0.12
+#: And its bound at any speed, m/s.
 FASTEST_ASIDE_MPS = 2.0
-#: Time to the edge of the road, s, and what is kept from it, m.
-EDGE_S, EDGE_M = 0.8, 0.15
+#: A body reaches the edge of the road in this time at the soonest, s.
+EDGE_S = 0.8
+#: What is kept from the edge, m.
+EDGE_M = 0.15
 #: A driver looks this far ahead for the lane that another one is entering, s.
 ANTICIPATION_S = 1.0
 #: Decisions after which a driver's age, and the time since its last lane change, count no more.
@@ -84,8 +87,12 @@ _MOST_LIKELY = 0.98
 class Tokens(NamedTuple):
     """Tokens of a change in physical units: dense around 0, sparse where changes are large.
 
-    ``scale`` is where the spacing begins to grow, ``most`` the outer tokens' value, ``number`` how
-    many there are. A value lies at ``asinh(value / scale)``, spaced evenly.
+    A value lies at ``asinh(value / scale)``, spaced evenly.
+
+    Attributes:
+        scale: value at which the spacing begins to grow.
+        most: value of the outer token; that of the other outer one has the opposite sign.
+        number: how many tokens there are.
     """
 
     scale: float
@@ -98,20 +105,23 @@ class Tokens(NamedTuple):
         return math.asinh(self.most / self.scale)
 
     def centres(self, like: Tensor) -> Tensor:
-        """Values of the tokens [number]."""
-        return self.value(torch.arange(self.number, device=like.device).to(like.dtype))
+        """Values of the tokens [number], on the device and in the type of ``like``."""
+        numbers = torch.arange(self.number, device=like.device)
+        return self.value(numbers.to(like.dtype))
 
     def value(self, index: Tensor) -> Tensor:
-        """Value at a real-valued index."""
-        return self.scale * torch.sinh((index / (self.number - 1) * 2.0 - 1.0) * self.reach)
+        """Value at a real-valued index, from 0 to ``number - 1``."""
+        # From -1 to 1.
+        place = index / (self.number - 1) * 2.0 - 1.0
+        return self.scale * torch.sinh(place * self.reach)
 
     def soft_target(self, value: Tensor) -> Tensor:
         """A distribution over the tokens around ``value`` [...], as probabilities [..., number]:
         a discrete Gaussian of :data:`BLUR` tokens.
         """
-        # The value's real-valued index, from 0 to number - 1.
-        place = torch.asinh(value / self.scale).clamp(-self.reach, self.reach)
-        index = (place / self.reach + 1.0) * 0.5 * (self.number - 1)
+        # The value's real-valued index, from 0 to number - 1: the inverse of ``value``.
+        reached = torch.asinh(value / self.scale).clamp(-self.reach, self.reach)
+        index = (reached / self.reach + 1.0) * 0.5 * (self.number - 1)
 
         # Distances of all tokens from it, in standard deviations.
         numbers = torch.arange(self.number, device=value.device).to(value.dtype)
@@ -119,15 +129,21 @@ class Tokens(NamedTuple):
         return torch.softmax(-0.5 * distance * distance, -1)
 
     def sample(self, logits: Tensor, u: Tensor, temperature: float = 1.0) -> Tensor:
-        """Values [...] from uniform numbers ``u`` [...] and ``logits`` [..., number]: the inverse
-        of the distribution function, linear within a token.
+        """Values [...] that are drawn: the inverse of the distribution function, linear within a
+        token.
+
+        Args:
+            logits: of the tokens, [..., number].
+            u: uniform numbers [...].
+            temperature: below 1, the distribution is sharper.
         """
         chance = torch.softmax(logits / temperature, -1)
         # The distribution function at the upper end of every token.
         upper = chance.cumsum(-1)
 
         # The token in which u lies; rounding may leave the last upper end below 1.
-        token = (upper < u[..., None]).sum(-1, keepdim=True).clamp_max(self.number - 1)
+        token = (upper < u[..., None]).sum(-1, keepdim=True)
+        token = token.clamp_max(self.number - 1)
         token_chance = chance.gather(-1, token)[..., 0].clamp_min(1e-9)
         token_lower = upper.gather(-1, token)[..., 0] - token_chance
 
@@ -168,20 +184,26 @@ class Memory(NamedTuple):
 
 def memory_of(accelerations: Tensor, lateral_speeds: Tensor, age: Tensor) -> Memory:
     """A memory [N, M] without style and closing speeds; the last lane change is long ago."""
-    closing = age.new_zeros(*age.shape, HUMAN_MEMORY["closing"])
-    style = age.new_zeros(*age.shape, HUMAN_MEMORY["style"])
-    since = torch.full_like(age, LONG_AGO)
-    return Memory(accelerations, lateral_speeds, closing, style, age, since)
+    return Memory(
+        accelerations,
+        lateral_speeds,
+        closing=age.new_zeros(*age.shape, HUMAN_MEMORY["closing"]),
+        style=age.new_zeros(*age.shape, HUMAN_MEMORY["style"]),
+        age=age,
+        since=torch.full_like(age, LONG_AGO),
+    )
 
 
 class View(NamedTuple):
     """What drivers perceive of lanes, neighbours and their own motion.
 
     Attributes:
-        speed, aside: their own along and across the road, m/s, [N, M].
+        speed: their own along the road, m/s, [N, M].
+        aside: their own across the road, m/s, [N, M].
         lane: whose centre is nearest, [N, M], float.
         exists: whether there is a lane to the left, to the right, [N, M, 2].
-        ahead, behind: the nearest in three lanes, [N, M, 3].
+        ahead: the nearest vehicles ahead in three lanes, [N, M, 3].
+        behind: the nearest ones behind, [N, M, 3].
         log_headway: logarithm of the headway in s of drivers who follow, NaN for others, [N, M].
         relative_speed: over the mean of the neighbours, m/s, [N, M].
     """
@@ -237,12 +259,23 @@ def velocity(vehicles: Vehicles) -> tuple[Tensor, Tensor]:
     return along, across
 
 
-def lane_after(y: Tensor, aside: Tensor, road: Road, seconds: float) -> Tensor:
-    """The lane that a vehicle at ``y`` in m is in after so long at the lateral speed ``aside`` in
-    m/s; at most the next one.
+def lane_after(
+    y: Tensor,
+    aside: Tensor,
+    road: Road,
+    seconds: float,
+) -> Tensor:
+    """The lane that a vehicle is in some time later, at most the next one.
+
+    Args:
+        y: where it is across the road now, m.
+        aside: its lateral speed, m/s.
+        road: that it is on.
+        seconds: how much later.
     """
     lane = road.lane_of(y)
-    return road.lane_of(y + seconds * aside).clamp(lane - 1, lane + 1)
+    later = road.lane_of(y + seconds * aside)
+    return later.clamp(lane - 1, lane + 1)
 
 
 def perceive(vehicles: Vehicles, road: Road, sides: bool = True) -> View:
@@ -259,7 +292,9 @@ def perceive(vehicles: Vehicles, road: Road, sides: bool = True) -> View:
     # Who changes lanes is in both; absent vehicles are in none.
     soon = lane_after(vehicles.y, aside, road, ANTICIPATION_S)
     nowhere = torch.where(vehicles.valid, 0.0, torch.inf)
-    presence = LaneRange(torch.minimum(lane, soon) + nowhere, torch.maximum(lane, soon))
+    rightmost = torch.minimum(lane, soon) + nowhere
+    leftmost = torch.maximum(lane, soon)
+    presence = LaneRange(rightmost, leftmost)
     scene = scene_of(vehicles, road)._replace(presence=presence)
 
     lanes = torch.stack((lane - 1, lane, lane + 1), -1)
@@ -267,11 +302,12 @@ def perceive(vehicles: Vehicles, road: Road, sides: bool = True) -> View:
     ahead = _nearest_on(1, scene, lanes, speed, aside, sides)
     behind = _nearest_on(-1, scene, lanes, speed, aside, sides)
 
-    # Followers within 80 m show their headway.
+    # Followers within 80 m show their headway. The bounds keep it finite where vehicles stand.
     gap = ahead.gap[..., SAME]
     follows = ahead.exists[..., SAME] & (gap < 80.0)
-    headway = (gap.clamp_min(0.5) / speed.clamp_min(2.0)).clamp(0.2, 6.0)
-    log_headway = torch.where(follows, torch.log(headway), torch.nan)
+    headway_s = gap.clamp_min(0.5) / speed.clamp_min(2.0)
+    log_headway = torch.log(headway_s.clamp(0.2, 6.0))
+    log_headway = torch.where(follows, log_headway, torch.nan)
 
     # Over the up to six neighbours, [N, M, 6].
     seen = torch.cat((ahead.exists, behind.exists), -1)
@@ -282,7 +318,12 @@ def perceive(vehicles: Vehicles, road: Road, sides: bool = True) -> View:
 
 
 def _nearest_on(
-    side: int, scene: Scene, lanes: Tensor, speed: Tensor, aside: Tensor, sides: bool
+    side: int,
+    scene: Scene,
+    lanes: Tensor,
+    speed: Tensor,
+    aside: Tensor,
+    sides: bool,
 ) -> Near:
     """The nearest vehicles ahead (``side`` 1) or behind (-1) in ``lanes`` [N, M, 3].
 
@@ -296,19 +337,20 @@ def _nearest_on(
     which = torch.where(exists, index, 0)
 
     def of_nearest(number: Tensor) -> Tensor:
+        """A number [N, M] of every vehicle, of those in ``which``: [N, M, 3]."""
         return number.gather(1, which.flatten(1)).view(gap.shape)
 
     vehicles = scene.vehicles
     closing = of_nearest(speed) - speed[..., None]
     to_the_left = of_nearest(vehicles.y) - vehicles.y[..., None]
     return Near(
-        torch.where(exists, gap, SIGHT_M),
-        torch.where(exists, closing, 0.0),
-        torch.where(exists, of_nearest(vehicles.acceleration), 0.0),
-        torch.where(exists, to_the_left, 0.0),
-        torch.where(exists, of_nearest(aside), 0.0),
-        exists,
-        which,
+        gap=torch.where(exists, gap, SIGHT_M),
+        closing=torch.where(exists, closing, 0.0),
+        acceleration=torch.where(exists, of_nearest(vehicles.acceleration), 0.0),
+        aside=torch.where(exists, to_the_left, 0.0),
+        lateral_speed=torch.where(exists, of_nearest(aside), 0.0),
+        exists=exists,
+        which=which,
     )
 
 
@@ -322,13 +364,24 @@ class Situation(NamedTuple):
 
 
 def situation_of(
-    vehicles: Vehicles, memory: Memory, road: Road, sides: bool = True, first: Tensor | None = None
+    vehicles: Vehicles,
+    memory: Memory,
+    road: Road,
+    sides: bool = True,
+    first: Tensor | None = None,
 ) -> Situation:
-    """What drivers perceive now (:func:`perceive`), with this decision's style in their memory
-    (:func:`with_style`, as is ``first``).
+    """What drivers perceive now, with this decision's style in their memory.
+
+    Args:
+        vehicles: fields [N, M].
+        memory: after the last decision.
+        road: that they are on.
+        sides: as in :func:`perceive`.
+        first: as in :func:`with_style`.
     """
     view = perceive(vehicles, road, sides)
-    return Situation(vehicles, with_style(memory, view, first), road, view)
+    memory = with_style(memory, view, first)
+    return Situation(vehicles, memory, road, view)
 
 
 def features_of(situation: Situation) -> Tensor:
@@ -358,9 +411,11 @@ def _own_state(situation: Situation) -> list[Tensor]:
     vehicles, memory, road, view = situation
     speed = view.speed
     target = vehicles.target_lane.to(speed.dtype)
+
     # To the left of the lanes' centres, m.
     from_target = vehicles.y - road.centre_of(target)
     from_centre = vehicles.y - road.centre_of(view.lane)
+
     return [
         # Motion along the road.
         speed / 10.0,
@@ -389,17 +444,26 @@ def _leader_of_leader(ahead: Near) -> list[Tensor]:
     """
     leader = ahead.which[..., SAME]
     follows = ahead.exists[..., SAME]
-    # What the leader sees ahead of itself, gathered to who follows it, [N, M].
     exists = follows & follows.gather(1, leader)
-    gap = torch.where(exists, ahead.gap[..., SAME].gather(1, leader), SIGHT_M)
-    closing = torch.where(exists, ahead.closing[..., SAME].gather(1, leader), 0.0)
-    return [_log_gap(gap), torch.asinh(closing), ahead.acceleration[..., SAME] / 1.5]
+
+    # What the leader sees ahead of itself, gathered to who follows it, [N, M].
+    gap = ahead.gap[..., SAME].gather(1, leader)
+    gap = torch.where(exists, gap, SIGHT_M)
+    closing = ahead.closing[..., SAME].gather(1, leader)
+    closing = torch.where(exists, closing, 0.0)
+
+    return [
+        _log_gap(gap),
+        torch.asinh(closing),
+        ahead.acceleration[..., SAME] / 1.5,
+    ]
 
 
 def _room(situation: Situation) -> list[Tensor]:
     """8 numbers: room to those alongside, to the edges of the road, and where the leader is."""
     vehicles, _, road, view = situation
-    ahead, width = view.ahead, vehicles.width
+    ahead = view.ahead
+    width = vehicles.width
 
     # Who is level with the driver, give or take 1 m; distances of the centres, m, 9 for nobody.
     numbers = []
@@ -411,6 +475,7 @@ def _room(situation: Situation) -> list[Tensor]:
             distance = torch.where(beside, sign * near.aside[..., side], 9.0)
             nearest_aside = torch.minimum(nearest_aside, distance)
             alongside = alongside | beside
+
         # Between the bodies, if the other one is as wide.
         room = nearest_aside - width
         numbers += [room.clamp(-0.5, 1.5), alongside.to(width.dtype)]
@@ -432,12 +497,22 @@ def _seen(near: Near, speed: Tensor) -> tuple[Tensor, ...]:
     exists = near.exists.to(speed.dtype)
     # Nobody is as far away as can be seen: 2.7 is the logarithm of 150 m in units of 10 m.
     distance = exists * _log_gap(near.gap) + (1.0 - exists) * 2.7
+
+    # The time in which the driver covers the gap, s; at least 3 m/s, for those who stand.
     pace = speed.clamp_min(3.0)[..., None]
-    time_s = (near.gap / pace).clamp(-1.0, 5.0) * 0.5
+    time_s = (near.gap / pace).clamp(-1.0, 5.0)
+
     # The reciprocal of the time to collision, 1/s.
-    approach = (-near.closing / near.gap.clamp_min(2.0)).clamp(-1.0, 1.0) * 3.0
-    numbers = torch.stack((distance, time_s, torch.asinh(near.closing), approach, exists), -2)
-    return numbers.flatten(-2).unbind(-1)
+    approach = (-near.closing / near.gap.clamp_min(2.0)).clamp(-1.0, 1.0)
+
+    numbers = (
+        distance,
+        time_s * 0.5,
+        torch.asinh(near.closing),
+        approach * 3.0,
+        exists,
+    )
+    return torch.stack(numbers, -2).flatten(-2).unbind(-1)
 
 
 def _sides_of(situation: Situation) -> Tensor:
@@ -445,21 +520,28 @@ def _sides_of(situation: Situation) -> Tensor:
     same order for both: mirrored scenes have mirrored numbers.
     """
     vehicles, memory, road, view = situation
-    speed, ahead, behind = view.speed, view.ahead, view.behind
+    speed = view.speed
+    ahead = view.ahead
+    behind = view.behind
     pace = speed.clamp_min(3.0)
     own_gap = _log_gap(view.gap)
+    from_centre = vehicles.y - road.centre_of(view.lane)
+    since = memory.since.clamp_max(LONGEST) / LONGEST
+
     # How much faster the lanes are, m/s, [N, M, 3]: on a free lane one could be faster by 3 m/s.
     gain = torch.where(ahead.exists, ahead.closing, 3.0).clamp(-5.0, 5.0)
     here = gain[..., SAME]
-    from_centre = vehicles.y - road.centre_of(view.lane)
+
     # A change begins with a decision, not with the drift of a driver who keeps its lane: recorded
     # ones are found by how they move, which a choice of when to begin must not see.
     under_way = (vehicles.target_lane != view.lane).to(speed.dtype)
-    since = memory.since.clamp_max(LONGEST) / LONGEST
 
     sides = []
     for side, sign in _SIDES:
-        front, rear = ahead.gap[..., side], behind.gap[..., side]
+        # In the lane on this side: gaps, m, closing speeds and what there is to gain, m/s.
+        front = ahead.gap[..., side]
+        rear = behind.gap[..., side]
+        front_closing = ahead.closing[..., side]
         rear_closing = behind.closing[..., side]
         there = gain[..., side]
 
@@ -481,7 +563,7 @@ def _sides_of(situation: Situation) -> Tensor:
             (there - here) / 3.0,
             # Danger: REAR_BRAKING, FRONT_BRAKING, bodies that nearly touch.
             _needed_braking(rear_closing, rear),
-            _needed_braking(-ahead.closing[..., side], front),
+            _needed_braking(-front_closing, front),
             (1.5 - front).clamp(0.0, 2.0),
             (1.5 - rear).clamp(0.0, 2.0),
             # Motion towards the new lane, of the others and the driver's own.
@@ -495,22 +577,30 @@ def _sides_of(situation: Situation) -> Tensor:
 
 
 def leaves_room(side: Tensor, room_m: float = 2.0, hardest: float = 2.5) -> Tensor:
-    """Whether a change to a side [..., SIDE_FEATURES] leaves ``room_m`` ahead and behind and makes
-    nobody brake harder than ``hardest`` m/s2; bool [...].
+    """Whether a lane change leaves room and makes nobody brake hard; bool [...].
+
+    Args:
+        side: what counts for the change, [..., SIDE_FEATURES].
+        room_m: gaps ahead and behind are larger than this, m.
+        hardest: the braking that it asks for is below this, m/s2.
     """
     # The first two numbers of a side are its gaps ahead and behind, in this unit.
     least = math.log1p(room_m) - 2.5
+    ahead = side[..., 0] > least
+    behind = side[..., 1] > least
     braking = torch.maximum(side[..., REAR_BRAKING], side[..., FRONT_BRAKING])
-    return (side[..., 0] > least) & (side[..., 1] > least) & (braking < hardest)
+    return ahead & behind & (braking < hardest)
 
 
 def _needed_braking(closing: Tensor, gap: Tensor) -> Tensor:
     """Deceleration that keeps the rear one off the front one, m/s2, at most 8.
 
-    It stops closing in over the gap but its last metre: v^2 / (2 s).
+    It stops closing in over the gap but its last metre: v^2 / (2 s). ``closing`` is by how much the
+    rear one is faster, m/s, ``gap`` in m.
     """
     distance = (gap - 1.0).clamp_min(0.3)
-    return (closing.clamp_min(0.0).square() / (2.0 * distance)).clamp_max(8.0)
+    braking = closing.clamp_min(0.0).square() / (2.0 * distance)
+    return braking.clamp_max(8.0)
 
 
 def layers(*widths: int) -> nn.Sequential:
@@ -518,6 +608,7 @@ def layers(*widths: int) -> nn.Sequential:
     parts: list[nn.Module] = []
     for before, after in pairwise(widths):
         parts += [nn.Linear(before, after), nn.SiLU()]
+    # None after the last layer.
     return nn.Sequential(*parts[:-1])
 
 
@@ -526,11 +617,16 @@ class HumanPolicy(nn.Module):
 
     One network for both tokens, a small one of its own for lane changes, which are rare. It judges
     both sides alike, with two logits for each: to begin a change, and to break one off.
+
+    Attributes:
+        trunk: from features to what both tokens are read from.
+        along: logits of the tokens :data:`ALONG`.
+        across: logits of the tokens :data:`ACROSS`.
+        lane: from what counts for a side to its two logits.
     """
 
     def __init__(self, sizes: HumanSizes) -> None:
         super().__init__()
-
         self.trunk = layers(FEATURES, sizes.hidden, sizes.hidden).append(nn.SiLU())
         self.along = nn.Linear(sizes.hidden, ALONG.number)
         self.across = nn.Linear(sizes.hidden, ACROSS.number)
@@ -545,21 +641,26 @@ class HumanPolicy(nn.Module):
 
     def lane_chances(self, choice: LaneChoice, factor: float = 1.0) -> Tensor:
         """Probabilities [..., 3]: to go on; to begin a change to the left, or break one off; to
-        begin one to the right. ``factor``: of the probabilities to begin one.
+        begin one to the right.
+
+        Args:
+            choice: what drivers could do.
+            factor: of the probabilities to begin a change; traffic may have more or fewer of them.
         """
         to_begin, to_stop = self.lane(choice.sides).unbind(-1)
 
-        # Of the changes to the left and to the right, [..., 2].
+        # Of the changes to the left and to the right, [..., 2]; both together have a bound.
         begin = torch.sigmoid(to_begin) * choice.exists * (_MOST_LIKELY * factor)
         total = begin.sum(-1, keepdim=True).clamp_min(1e-9)
         begin = begin * (total.clamp_max(_MOST_LIKELY) / total)
 
         # Of the side to which a change is under way.
-        stop = torch.sigmoid(torch.where(choice.to_left, to_stop[..., 0], to_stop[..., 1]))
+        to_stop = torch.where(choice.to_left, to_stop[..., 0], to_stop[..., 1])
+        stop = torch.sigmoid(to_stop)
 
+        # All of them have finite logarithms, which fine-tuning takes.
         first = torch.where(choice.keeping, begin[..., 0], stop).clamp_min(1e-9)
         second = torch.where(choice.keeping, begin[..., 1], 0.0).clamp_min(1e-9)
-        # All of them have finite logarithms, which fine-tuning takes.
         go_on = (1.0 - first - second).clamp_min(1e-6)
         return torch.stack((go_on, first, second), -1)
 
@@ -584,25 +685,34 @@ def lane_choice(situation: Situation) -> LaneChoice:
     """The choice that each driver has."""
     target = situation.vehicles.target_lane
     lane = situation.view.lane.long()
-    sides = _sides_of(situation)
-    return LaneChoice(sides, situation.view.exists, target == lane, target > lane)
+    return LaneChoice(
+        sides=_sides_of(situation),
+        exists=situation.view.exists,
+        keeping=target == lane,
+        to_left=target > lane,
+    )
 
 
 def with_choice(situation: Situation, choice: Tensor) -> Situation:
-    """The situation after a ``choice`` [N, M] of 0, 1 or 2 (:meth:`HumanPolicy.lane_chances`): who
-    has chosen another lane heads for it and counts anew.
+    """The situation after a lane choice: who has chosen another lane heads for it.
+
+    Args:
+        situation: at the decision.
+        choice: [N, M], 0, 1 or 2 as in :meth:`HumanPolicy.lane_chances`.
     """
     vehicles, memory, road, view = situation
-    old, lane = vehicles.target_lane, view.lane.long()
+    old = vehicles.target_lane
+    lane = view.lane.long()
 
     # Who keeps its lane may begin a change; who is on its way may go back to its lane.
     step = (choice == 1).long() - (choice == 2).long()
     broken_off = torch.where(choice == 1, lane, old)
     target = torch.where(old == lane, old + step, broken_off)
 
+    # The time since a change began or ended counts anew.
     since = torch.where(target != old, 0.0, memory.since)
-    vehicles = vehicles.with_(target_lane=target)
-    return Situation(vehicles, memory._replace(since=since), road, view)
+    memory = memory._replace(since=since)
+    return Situation(vehicles.with_(target_lane=target), memory, road, view)
 
 
 def chosen(chances: Tensor, u: Tensor) -> Tensor:
@@ -616,25 +726,30 @@ def chosen(chances: Tensor, u: Tensor) -> Tensor:
 def with_style(memory: Memory, view: View, first: Tensor | None = None) -> Memory:
     """The memory with this decision's style: an exponential mean over :data:`STYLE_S`.
 
-    ``first`` [N, M]: drivers seen for the first time, who have closed in as they do now.
+    Args:
+        memory: after the last decision.
+        view: what drivers perceive now.
+        first: drivers seen for the first time, who have closed in as they do now, [N, M]; None:
+            there are none.
     """
     old = memory.style
     free = view.log_headway.isnan()
 
     # What the driver shows now, [N, M, 3]; without a leader its headway stays what it was.
-    headway = torch.where(free, old[..., 0], view.log_headway)
+    log_headway = torch.where(free, old[..., 0], view.log_headway)
     effort = memory.accelerations[..., 0].square()
     pace = (view.relative_speed / 3.0).clamp(-2.0, 2.0)
-    shown = torch.stack((headway, effort, pace), -1)
+    shown = torch.stack((log_headway, effort, pace), -1)
 
     style = old + DECISION_S / STYLE_S * (shown - old)
     if first is None:
         return memory._replace(style=style)
 
     # Who follows nobody yet is taken to keep 2 s; everybody begins with a middling effort.
-    headway = torch.where(free, math.log(2.0), view.log_headway)
-    effort = torch.full_like(headway, 0.5)
-    begun = torch.stack((headway, effort, pace), -1)
+    log_headway = torch.where(free, math.log(2.0), view.log_headway)
+    effort = torch.full_like(log_headway, 0.5)
+    begun = torch.stack((log_headway, effort, pace), -1)
+
     first = first[..., None]
     return memory._replace(
         style=torch.where(first, begun, style),
@@ -652,6 +767,9 @@ def bounded(situation: Situation, change: Tensor, aside: Tensor) -> tuple[Tensor
         situation: of drivers [N, M].
         change: of the acceleration since the last decision, m/s2, [N, M].
         aside: change of the lateral speed, m/s, [N, M].
+
+    Returns:
+        Accelerations, m/s2, and lateral speeds, m/s, [N, M].
     """
     vehicles, memory, road, view = situation
 
@@ -667,6 +785,7 @@ def bounded(situation: Situation, change: Tensor, aside: Tensor) -> tuple[Tensor
     lateral = torch.minimum(view.aside + aside, to_left)
     lateral = torch.maximum(lateral, -to_right)
 
+    # A car turns no more sharply than this, even to come back from beyond an edge.
     most = (STEEPEST * view.speed).clamp_max(FASTEST_ASIDE_MPS)
     return acceleration, lateral.clamp(-most, most)
 
@@ -674,38 +793,56 @@ def bounded(situation: Situation, change: Tensor, aside: Tensor) -> tuple[Tensor
 def remembered(situation: Situation, acceleration: Tensor) -> Memory:
     """The memory a decision later, of drivers who held this ``acceleration`` [N, M], m/s2."""
     _, memory, _, view = situation
+
     # Newest first; the oldest is forgotten.
-    accelerations = torch.cat((acceleration[..., None], memory.accelerations[..., :-1]), -1)
+    before = memory.accelerations[..., :-1]
+    accelerations = torch.cat((acceleration[..., None], before), -1)
     lateral_speeds = torch.stack((view.aside, memory.lateral_speeds[..., 0]), -1)
     closing = torch.stack((view.closing, memory.closing[..., 0]), -1)
+
     return Memory(
         accelerations,
         lateral_speeds,
         closing,
-        memory.style,
-        memory.age + 1.0,
-        memory.since + 1.0,
+        style=memory.style,
+        age=memory.age + 1.0,
+        since=memory.since + 1.0,
     )
 
 
 def moved(vehicles: Vehicles, acceleration: Tensor, aside: Tensor) -> Vehicles:
-    """The vehicles 0.4 s later: constant ``acceleration``, m/s2, and a lateral speed that changes
-    evenly to ``aside``, m/s, [N, M] both.
+    """The vehicles 0.4 s later, at a constant acceleration and an evenly changing lateral speed.
+
+    Args:
+        vehicles: at the decision, [N, M].
+        acceleration: along the road, m/s2, [N, M].
+        aside: lateral speed at the end, m/s, [N, M].
     """
     speed, lateral = velocity(vehicles)
-    later = (speed + acceleration * DECISION_S).clamp_min(0.0)
+    speed_later = (speed + acceleration * DECISION_S).clamp_min(0.0)
     # At the mean of the speeds before and after.
-    x = vehicles.x + 0.5 * (speed + later) * DECISION_S
+    x = vehicles.x + 0.5 * (speed + speed_later) * DECISION_S
     y = vehicles.y + 0.5 * (lateral + aside) * DECISION_S
     vehicles = vehicles.with_(x=x, y=y, acceleration=acceleration)
-    return with_velocity(vehicles, later, aside)
+    return with_velocity(vehicles, speed_later, aside)
 
 
-def cars(x: Tensor, y: Tensor, speed: Tensor, aside: Tensor, **others: Tensor) -> Vehicles:
-    """Vehicles at these speeds along and across the road, m/s, seen where their centres are.
+def cars(
+    x: Tensor,
+    y: Tensor,
+    speed: Tensor,
+    aside: Tensor,
+    **others: Tensor,
+) -> Vehicles:
+    """Vehicles [N, M] at these speeds, which others see in the lanes where their centres are.
 
-    Positions of the centres in m, all [N, M]. ``others``: the further fields but heading and
-    visibility; all are valid unless it says otherwise.
+    Args:
+        x: of the centres along the road, m.
+        y: of the centres across the road, m.
+        speed: along the road, m/s.
+        aside: across the road, m/s.
+        others: the further fields but heading and visibility; all vehicles are valid unless it says
+            otherwise.
     """
     vehicles = Vehicles(
         x=x,
@@ -722,9 +859,10 @@ def with_velocity(vehicles: Vehicles, along: Tensor, across: Tensor) -> Vehicles
     """The vehicles at these speeds [N, M], m/s; nobody moves more aside than a fifth of its way
     ahead.
     """
+    across = across.clamp(-0.2 * along, 0.2 * along)
+
     # Who stands keeps its heading.
     moves = along > 0.0
-    across = across.clamp(-0.2 * along, 0.2 * along)
     heading = torch.where(moves, torch.atan2(across, along), vehicles.heading)
     speed = torch.where(moves, torch.hypot(along, across), 0.0)
     return vehicles.with_(speed=speed, heading=heading)

@@ -34,12 +34,24 @@ if TYPE_CHECKING:
 
 #: Width of the networks' layers.
 HIDDEN = 64
-#: Of the fit.
-UPDATES, BATCH, RATE = 3000, 1024, 2e-3
+
+# The fit of the estimator.
+#: How many updates there are.
+UPDATES = 3000
+#: Drivers of an update.
+BATCH = 1024
+#: The highest learning rate.
+RATE = 2e-3
 #: Errors that weigh alike: speed, both accelerations, both lateral speeds, both places.
 SCALES = (0.3, 0.8, 0.8, 0.1, 0.1, 0.05, 0.05)
-#: Units of the observer along and across, m: of the motions, the forecast, and the differences.
-OBSERVED_SCALE, FORECAST_SCALE, DIFFERENCE_SCALE = (0.1, 0.03), (0.3, 0.1), (0.1, 0.03)
+
+# Units of the observer, along and across, m.
+#: Of the displacements in 0.1 s.
+OBSERVED_SCALE = (0.1, 0.03)
+#: Of the forecast positions.
+FORECAST_SCALE = (0.3, 0.1)
+#: Of the differences that it adds to them.
+DIFFERENCE_SCALE = (0.1, 0.03)
 
 
 class Estimator(nn.Module):
@@ -71,9 +83,11 @@ class Estimator(nn.Module):
         out = self.layers(torch.cat(inputs, -1))
         scale = torch.tensor([1.0, 1.0, 1.0, 0.3, 0.3, 0.1, 0.1])
 
-        # The network corrects the mean speeds along and across.
+        # The network corrects the mean speeds along and across: an output of 0 is a driver at
+        # constant velocity, whose last position is exact.
         level = torch.zeros_like(out)
         level[..., 0] = mean[..., 0, 0]
+        # Both lateral speeds.
         level[..., 3:5] = mean[..., 0, 1:2]
         return level + scale * out
 
@@ -91,23 +105,35 @@ class Observer(nn.Module):
         self.layers = layers(2 * inputs, HIDDEN, HIDDEN, 2 * PREDICTED_STEPS)
 
     def forward(self, positions: Tensor, forecast: Tensor) -> Tensor:
-        """Differences [..., 8, 2] in m; positions [..., 9, 2] and forecast [..., 8, 2] are relative
-        to the last position.
+        """Differences [..., 8, 2] in m, recorded less forecast.
+
+        Args:
+            positions: the observed ones, relative to the last of them, [..., 9, 2] in m.
+            forecast: the next positions, relative to the same point, [..., 8, 2] in m.
         """
         # Displacements in 0.1 s and their mean, m.
         motion = positions.diff(dim=-2)
         mean = motion.mean(-2, keepdim=True)
         steps = torch.arange(1, PREDICTED_STEPS + 1, device=mean.device)[:, None]
 
-        # What both have beyond a constant velocity.
+        # What both have beyond a constant velocity, [..., 8, 2], in units that make it about 1.
         apart = (motion - mean) / motion.new_tensor(OBSERVED_SCALE)
         ahead = (forecast - steps * mean) / motion.new_tensor(FORECAST_SCALE)
-        out = self.layers(torch.cat((apart.flatten(-2), ahead.flatten(-2)), -1))
-        return out.unflatten(-1, (PREDICTED_STEPS, 2)) * motion.new_tensor(DIFFERENCE_SCALE)
+
+        inputs = torch.cat((apart.flatten(-2), ahead.flatten(-2)), -1)
+        out = self.layers(inputs).unflatten(-1, (PREDICTED_STEPS, 2))
+        return out * motion.new_tensor(DIFFERENCE_SCALE)
 
 
 class HumanModel(nn.Module):
-    """What a file of ``human`` holds: the policy; estimator and observer for forecasts."""
+    """What a file of ``human`` holds: the policy; estimator and observer for forecasts.
+
+    Attributes:
+        sizes: of the policy; those of the two other networks are constants.
+        policy: how drivers move and change lanes.
+        estimator: how they move at the present, from nine positions.
+        observer: what a recording will show besides.
+    """
 
     def __init__(self, sizes: HumanSizes) -> None:
         super().__init__()
@@ -121,23 +147,32 @@ def roughness(positions: Tensor) -> Tensor:
     """How much speeds jitter from step to step, m/s, along and across, [..., 2].
 
     The root mean square of the velocity's second difference, which a driver's motion has hardly.
+    ``positions`` are [..., 9, 2] in m.
     """
     motion = positions.diff(dim=-2) / PHYSICS_STEP_S
-    return motion.diff(dim=-2).diff(dim=-2).square().mean(-2).sqrt()
+    jitter = motion.diff(dim=-2).diff(dim=-2)
+    return jitter.square().mean(-2).sqrt()
 
 
 def trust(positions: Tensor) -> Tensor:
-    """How far a history [..., 9, 2] can be trusted, as the age of a driver in decisions, 1 to 5."""
-    return 1.0 + 4.0 * torch.exp(-roughness(positions)[..., 0] / 0.15)
+    """How far a history [..., 9, 2] can be trusted, as the age of a driver in decisions, 1 to 5.
+
+    The age tells the policy what a driver's memory is worth.
+    """
+    along = roughness(positions)[..., 0]
+    return 1.0 + 4.0 * torch.exp(-along / 0.15)
 
 
 def present_memory(motion: Tensor, age: Tensor) -> Memory:
-    """What drivers remember whose ``motion`` [N, M, 7] is the :class:`Estimator`'s.
+    """What drivers remember whose motion is an estimate.
 
-    ``age`` [N, M]: for how many decisions they count as seen (:func:`trust`).
+    Args:
+        motion: the :class:`Estimator`'s, [N, M, 7].
+        age: for how many decisions drivers count as seen (:func:`trust`), [N, M].
     """
     # Older accelerations than two decisions' are not known: 0.
     accelerations = pad(motion[..., 1:3], (0, ACCELERATIONS - 2))
+    # The one of 0.4 s ago stands for all before the present.
     lateral_speeds = motion[..., 4:5].repeat(1, 1, LATERAL_SPEEDS)
     return memory_of(accelerations, lateral_speeds, age)
 
@@ -149,73 +184,104 @@ def fit_estimator(
 
     What it is to find is the motion of the smoothed track, under none, some or all of the recorded
     noise. It needs no gradients afterwards.
+
+    Args:
+        estimator: it is changed in place.
+        scenes: recordings, smoothed.
+        random: draws drivers, shares of the noise, and sides.
     """
     raw, smooth, motion = _tracks(scenes)
     optimizer = torch.optim.Adam(estimator.parameters(), RATE)
     for update in range(UPDATES):
         optimizer.param_groups[0]["lr"] = RATE * half_cosine(update, UPDATES)
 
-        # Positions [B, 9, 2] with a share of the recorded noise.
+        # Positions [B, 9, 2] with a share of the recorded noise: none of it in a quarter of the
+        # rows, all of it in 0.4 of them.
         rows = torch.randint(len(raw), (BATCH,), generator=random)
-        noise = noise_shares(BATCH, 0.25, 0.65, random)
-        positions = smooth[rows] + noise * (raw[rows] - smooth[rows])
+        share = noise_shares(BATCH, 0.25, 0.65, random)
+        positions = smooth[rows] + share * (raw[rows] - smooth[rows])
 
         # The last two numbers are the error of the last position.
         wanted = motion[rows].clone()
         wanted[:, 5:] -= positions[:, -1]
 
-        # Mirrored at random: positions across, both lateral speeds, the error across.
+        # Near 0, where float32 is exact, and mirrored at random: positions across, both lateral
+        # speeds, the error across.
         side = random_sides(BATCH, random)
         positions = positions - positions[:, -1:]
         positions[..., 1] *= side
         wanted[:, [3, 4, 6]] *= side
+
         difference = estimator(positions.float()) - wanted.float()
         descend(optimizer, error_in(difference, SCALES))
     estimator.requires_grad_(False)
 
 
-def noise_shares(rows: int, without: float, as_recorded: float, random: torch.Generator) -> Tensor:
-    """Shares [rows, 1, 1] of the recorded noise: none, all, or a little more than that at most.
+def noise_shares(
+    rows: int,
+    without: float,
+    as_recorded: float,
+    random: torch.Generator,
+) -> Tensor:
+    """Shares [rows, 1, 1] of the recorded noise, from 0 to 1.2.
 
-    ``without`` is the chance of none, ``as_recorded`` that of none or all.
+    Args:
+        rows: how many shares.
+        without: chance of no noise at all.
+        as_recorded: chance of none or of all of it; else the share is drawn evenly.
+        random: draws them.
     """
-    share = 1.2 * torch.rand((rows, 1, 1), generator=random)
+    even = 1.2 * torch.rand((rows, 1, 1), generator=random)
+    # One number decides between the three cases.
     draw = torch.rand((rows, 1, 1), generator=random)
-    noisy = torch.where(draw < as_recorded, 1.0, share)
+    noisy = torch.where(draw < as_recorded, 1.0, even)
     return torch.where(draw < without, 0.0, noisy)
 
 
 def random_sides(rows: int, random: torch.Generator) -> Tensor:
     """Signs [rows, 1] of numbers across the road: left and right are alike."""
-    return torch.where(torch.rand((rows, 1), generator=random) < 0.5, -1.0, 1.0)
+    mirrored = torch.rand((rows, 1), generator=random) < 0.5
+    return torch.where(mirrored, -1.0, 1.0)
 
 
 def error_in(difference: Tensor, scales: tuple[float, ...]) -> Tensor:
-    """The mean smooth absolute error of a ``difference`` in units of ``scales``."""
+    """The mean smooth absolute error of a ``difference`` [..., K] in units of K ``scales``."""
     error = difference / torch.tensor(scales)
     return smooth_l1_loss(error, torch.zeros_like(error))
 
 
 def _tracks(scenes: Sequence[SmoothScene]) -> tuple[Tensor, Tensor, Tensor]:
-    """Nine recorded and smoothed positions [R, 9, 2], and the motion at the last one [R, 7].
+    """What the estimator is fitted to, of all drivers every 0.2 s; float64, since places on the
+    road are large numbers.
 
-    In float64, since places on the road are large numbers. The motion ends with the smoothed place
-    itself; what an :class:`Estimator` is to find is how far an observed one is from it.
+    Returns:
+        Nine recorded and nine smoothed positions, [R, 9, 2] in m, and the motion at the last one,
+        [R, 7]. The motion ends with the smoothed place itself; what an :class:`Estimator` is to
+        find is how far an observed one is from it.
     """
-    raw, smooth, motion = [], [], []
+    raw = []
+    smooth = []
+    motion = []
     for scene in scenes:
         for track in range(scene.x.shape[1]):
             rows = np.flatnonzero(scene.present[:, track])
-            # Every 0.2 s.
-            for last in range(rows[0] + OBSERVED_POSITIONS - 1, rows[-1] + 1, 2):
+            # Every 0.2 s, from the ninth position on.
+            first = rows[0] + OBSERVED_POSITIONS - 1
+            for last in range(first, rows[-1] + 1, 2):
+                # The frames of one driver.
                 nine = slice(last - OBSERVED_POSITIONS + 1, last + 1), track
                 raw.append(np.stack((scene.raw_x[nine], scene.raw_y[nine]), -1))
                 smooth.append(np.stack((scene.x[nine], scene.y[nine]), -1))
 
                 # At the last position, and one and two decisions before it, newest first.
                 speed = scene.speed[[last, last - STEPS, last - 2 * STEPS], track]
-                aside = scene.lateral_speed[[last, last - STEPS], track]
                 accelerations = -np.diff(speed) / DECISION_S
+                aside = scene.lateral_speed[[last, last - STEPS], track]
                 place = (scene.x[last, track], scene.y[last, track])
                 motion.append([speed[0], *accelerations, *aside, *place])
-    return tuple(torch.tensor(np.array(numbers)) for numbers in (raw, smooth, motion))  # type: ignore[return-value]
+
+    return (
+        torch.tensor(np.array(raw)),
+        torch.tensor(np.array(smooth)),
+        torch.tensor(np.array(motion)),
+    )

@@ -53,21 +53,36 @@ from ganlane.sim.idm import IdmParameters, following_acceleration, with_headways
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.state import Road, Vehicles
 
-#: Decisions of a segment: of whole scenes, and short ones, which begin more often as recorded.
-LONG_DECISIONS, SHORT_DECISIONS = 20, 5
+# What is fitted to.
+#: Decisions of a stretch of a scene.
+LONG_DECISIONS = 20
+#: Decisions of a short one; these begin more often as recorded.
+SHORT_DECISIONS = 5
 #: Weight of samples from files of one lane.
 ONE_LANE_WEIGHT = 0.5
-#: Random scenes of the prior, and vehicles in each.
-PRIOR_SCENES, PRIOR_VEHICLES = 9000, 8
-#: How much more strongly the policy is pulled to what it is in the second fine-tuning.
-SETTLING_TIMES = 2.0
-#: Samples of an update, and of the prior beside them.
+#: Random scenes of the prior.
+PRIOR_SCENES = 9000
+#: Vehicles in each of them.
+PRIOR_VEHICLES = 8
+
+# The moves.
+#: Samples of an update.
 BATCH = 1024
+#: Samples of the prior beside them, per sample.
 PRIOR_SHARE = 0.15
 #: Noise on the inputs, so that the policy does not hang on their last digits.
 INPUT_NOISE = 0.02
-#: Updates of the lane choice, its learning rate and decay: lane changes are few.
-LANE_UPDATES, LANE_RATE, LANE_DECAY = 300, 3e-3, 0.05
+
+# The lane choice: lane changes are few.
+#: How many updates there are.
+LANE_UPDATES = 300
+#: Their learning rate.
+LANE_RATE = 3e-3
+#: Decay of the weights.
+LANE_DECAY = 0.05
+
+#: How much more strongly the policy is pulled to what it is in the second fine-tuning.
+SETTLING_TIMES = 2.0
 
 
 def fit_steps(config: HumanConfig) -> int:
@@ -78,8 +93,12 @@ def fit_steps(config: HumanConfig) -> int:
 class Material(NamedTuple):
     """What a policy is fitted to: stretches of recordings, and the prior's samples.
 
-    ``around`` and ``ahead`` are stretches of two-dimensional scenes and of one lane; ``short`` are
-    short ones of both; ``danger`` are lane changes that nobody survives, [D, SIDE_FEATURES].
+    Attributes:
+        around: stretches of two-dimensional scenes, in which drivers see their sides.
+        ahead: stretches of one lane.
+        short: short stretches of both.
+        prior: moves where recordings are silent.
+        danger: sides to which a lane change leaves no room, [D, SIDE_FEATURES].
     """
 
     around: list[Cut]
@@ -90,19 +109,26 @@ class Material(NamedTuple):
 
 
 def material_of(scenes: Sequence[SmoothScene], random: torch.Generator) -> Material:
-    """Everything that a policy is fitted to, cut from smoothed ``scenes``.
+    """Everything that a policy is fitted to.
 
     Stretches overlap: they begin every few frames of 0.1 s, more often where scenes are few.
+
+    Args:
+        scenes: smoothed ones, of several lanes and of one.
+        random: draws the prior.
     """
     wide = [scene for scene in scenes if scene.two_dimensional]
     narrow = [scene for scene in scenes if not scene.two_dimensional]
+    short_wide = cuts(wide, SHORT_DECISIONS, stride=4)
+    short_narrow = cuts(narrow, SHORT_DECISIONS, stride=40)
+
     prior, danger = prior_samples(random)
     return Material(
-        cuts(wide, LONG_DECISIONS, 10),
-        cuts(narrow, LONG_DECISIONS, 60),
-        [*cuts(wide, SHORT_DECISIONS, 4), *cuts(narrow, SHORT_DECISIONS, 40)],
-        prior,
-        danger,
+        around=cuts(wide, LONG_DECISIONS, stride=10),
+        ahead=cuts(narrow, LONG_DECISIONS, stride=60),
+        short=short_wide + short_narrow,
+        prior=prior,
+        danger=danger,
     )
 
 
@@ -135,6 +161,7 @@ def fit_human(
         exact = [without_noise(recording, config) for recording in recordings]
         fit_estimator(model.estimator, [*scenes, *exact], random)
 
+        # Files of one lane show no motion across the road, so the estimator does without them.
         scenes += [smooth_scene(one, config, ONE_LANE_WEIGHT) for one in following]
         material = material_of(scenes, random)
 
@@ -143,9 +170,11 @@ def fit_human(
         teacher = _gathered(material, Options(), config, random, times=3).moves
 
         # Cloning: the first half of the epochs at the full rate, the second at half of it.
-        policy, danger = model.policy, material.danger
+        policy = model.policy
+        danger = material.danger
+        epochs = max(1, config.epochs // 2)
         for rate in (config.learning_rate, 0.5 * config.learning_rate):
-            train_moves(policy, teacher, material.prior, max(1, config.epochs // 2), rate, random)
+            train_moves(policy, teacher, material.prior, epochs, rate, random)
         train_lane_choice(policy, choices, danger, random)
         match_rate(policy, choices)
         report(None)
@@ -174,37 +203,64 @@ def close_the_loop(
 
     A round is fitted to its own closed-loop samples, to those of the round before, and to as many
     samples of the ``teacher``, in which everybody drives as recorded.
+
+    Args:
+        model: with a cloned policy and a fitted estimator.
+        material: whose stretches the policy drives.
+        teacher: moves as recorded.
+        config: rounds, epochs, learning rate, and moves drawn per decision.
+        random: draws moves, and the order of samples.
+        report: called after every round.
     """
     bank: list[Moves] = []
     options = Options(model.policy, samples=config.samples)
     noisy = options._replace(estimator=model.estimator)
+    epochs = max(1, config.epochs // 3)
+
     for number in range(config.rounds):
         # Long stretches begin as recorded, short ones as nine noisy positions show drivers.
         long = _gathered(material, options, config, random, times=2)
-        latest = joined([long, samples_of(material.short, noisy, random)]).moves
+        short = samples_of(material.short, noisy, random)
+        latest = joined([long, short]).moves
         bank = [*bank[-1:], latest]
 
+        # As many samples of the teacher as of this round, drawn anew.
         order = torch.randperm(len(teacher.change), generator=random)
         as_recorded = teacher.rows(order[: len(latest.change)])
         moves = Moves(*map(torch.cat, zip(as_recorded, *bank)))
 
         # From half of the cloning's rate down to a sixth of it.
-        rate = 0.5 * config.learning_rate * (1.0 - 0.7 * number / max(1, config.rounds - 1))
-        epochs = max(1, config.epochs // 3)
+        done = number / max(1, config.rounds - 1)
+        rate = 0.5 * config.learning_rate * (1.0 - 0.7 * done)
         train_moves(model.policy, moves, material.prior, epochs, rate, random)
         report(None)
 
 
 def _gathered(
-    material: Material, options: Options, config: HumanConfig, random: torch.Generator, times: int
+    material: Material,
+    options: Options,
+    config: HumanConfig,
+    random: torch.Generator,
+    times: int,
 ) -> Samples:
-    """Samples of all stretches: of scenes ``times`` over, of single lanes once.
+    """Samples of all stretches: of scenes several times, of single lanes once.
 
     Passes differ by what is drawn: sides swapped or hidden, lanes widened, moves of the policy. In
     the last pass the way is lengthened by up to ``config.scale``: the same traffic, but faster.
+
+    Args:
+        material: with the stretches.
+        options: who drives, and what is varied.
+        config: by how much the way is lengthened.
+        random: draws what differs.
+        times: passes over the scenes.
     """
     scales = [0.0] * (times - 1) + [config.scale]
-    parts = [samples_of(material.around, options._replace(scale=scale), random) for scale in scales]
+    parts = []
+    for scale in scales:
+        scaled = options._replace(scale=scale)
+        parts.append(samples_of(material.around, scaled, random))
+
     if material.ahead:
         # Cars of one lane have no sides to be hidden, and nothing to be mirrored.
         alone = options._replace(vary=False, blind=0.0)
@@ -230,9 +286,12 @@ def train_moves(
         prior: a batch holds :data:`PRIOR_SHARE` as many of these besides, drawn at random.
         epochs: passes over ``moves``.
         rate: the highest learning rate.
+        random: draws batches, and noise on their inputs.
     """
+    # The lane choice has a network of its own, which stays as it is.
     fitted = nn.ModuleList([policy.trunk, policy.along, policy.across])
     optimizer = torch.optim.AdamW(fitted.parameters(), lr=rate, weight_decay=1e-3, fused=True)
+
     rows = len(moves.change)
     updates = max(1, epochs * (rows // BATCH))
     update = 0
@@ -241,16 +300,20 @@ def train_moves(
             # The batch [B], and beside it [P] of the prior's samples.
             beside = int(PRIOR_SHARE * len(batch))
             of_prior = torch.randint(len(prior.change), (beside,), generator=random)
-            both = Moves(*map(torch.cat, zip(moves.rows(batch), prior.rows(of_prior))))
+            pairs = zip(moves.rows(batch), prior.rows(of_prior))
+            both = Moves(*map(torch.cat, pairs))
 
             # Logits [B + P, tokens] of what is seen with a little noise.
             noise = INPUT_NOISE * torch.randn(both.features.shape, generator=random)
             along, across = policy(both.features + noise)
+
+            # Cross-entropies [B + P].
             wanted_along = ALONG.soft_target(both.change)
             wanted_across = ACROSS.soft_target(both.aside)
             loss_along = -(wanted_along * along.log_softmax(-1)).sum(-1)
             loss_across = -(wanted_across * across.log_softmax(-1)).sum(-1)
-            loss = (loss_along * both.weight + loss_across * both.lateral_weight).mean()
+            weighted = loss_along * both.weight + loss_across * both.lateral_weight
+            loss = weighted.mean()
 
             # A short warm-up, then a half cosine to 0.
             rise = min(1.0, (update + 1) / 100)
@@ -260,7 +323,10 @@ def train_moves(
 
 
 def train_lane_choice(
-    policy: HumanPolicy, choices: Choices, danger: Tensor, random: torch.Generator
+    policy: HumanPolicy,
+    choices: Choices,
+    danger: Tensor,
+    random: torch.Generator,
 ) -> None:
     """Fit when a lane change begins, and when one is broken off.
 
@@ -271,7 +337,9 @@ def train_lane_choice(
         policy: its network ``lane`` has two logits per side: to begin a change, to break it off.
         choices: recorded ones; without a recorded change the policy stays as it is.
         danger: sides that nobody changes to, [D, SIDE_FEATURES].
+        random: draws batches.
     """
+    # Sides [S, SIDE_FEATURES] of three kinds.
     begun = choices.sides[choices.begins == 1]
     not_begun = choices.sides[choices.begins == 0]
     under_way = choices.sides[choices.begins < 0]
@@ -279,10 +347,12 @@ def train_lane_choice(
         return
 
     # Begin from the recorded rate, with little influence of what is seen.
+    log_odds = math.log(len(begun) / len(not_begun))
     weight, bias = policy.lane[-1].parameters()
     with torch.no_grad():
-        bias.copy_(torch.tensor([math.log(len(begun) / len(not_begun)), -2.0]))
+        bias.copy_(torch.tensor([log_odds, -2.0]))
         weight.mul_(0.1)
+
     optimizer = torch.optim.AdamW(policy.lane.parameters(), lr=LANE_RATE, weight_decay=LANE_DECAY)
     for _ in range(LANE_UPDATES):
         # All of the few recorded changes, and some of the many decisions against one.
@@ -290,17 +360,22 @@ def train_lane_choice(
         others = torch.randint(len(danger), (1024,), generator=random)
         begins = policy.lane(begun)[:, 0]
         stays = policy.lane(not_begun[rows])[:, 0]
-        in_danger = policy.lane(danger[others])
 
-        # The negative log-likelihood, per recorded change, so that few count as much as many.
+        # The negative log-likelihood, per recorded change, so that few count as much as many. The
+        # drawn decisions stand for all of them.
         scale = len(not_begun) / len(rows)
-        loss = (softplus(-begins).sum() + scale * softplus(stays).sum()) / len(begun)
+        negative_log_likelihood = softplus(-begins).sum() + scale * softplus(stays).sum()
+        loss = negative_log_likelihood / len(begun)
 
         # Into danger: begun with a logit below -10, broken off with a positive one.
-        loss = loss + 2.0 * softplus(in_danger[:, 0] + 10.0).mean()
-        loss = loss + softplus(-in_danger[:, 1]).mean()
+        to_begin, to_stop = policy.lane(danger[others]).unbind(-1)
+        loss = loss + 2.0 * softplus(to_begin + 10.0).mean()
+        loss = loss + softplus(-to_stop).mean()
+
+        # Under way as recorded: broken off with a logit below -1.
         if len(under_way):
-            loss = loss + 2.0 * softplus(policy.lane(under_way)[:, 1] + 1.0).mean()
+            to_stop = policy.lane(under_way)[:, 1]
+            loss = loss + 2.0 * softplus(to_stop + 1.0).mean()
         descend(optimizer, loss)
 
 
@@ -310,27 +385,37 @@ def match_rate(policy: HumanPolicy, choices: Choices) -> None:
 
     Where recorded drivers took gaps that count as danger here, no change begins; others make up for
     it. Only the level is moved: the bias of all beginnings.
+
+    Args:
+        policy: it is changed in place.
+        choices: recorded ones.
     """
     wanted = begins_per_decision(choices)
     _, bias = policy.lane[-1].parameters()
     choice = choices.keeping(slice(None))
     unmoved = bias[0].clone()
 
-    # Bisection: the rate grows with the bias.
-    low, high = -6.0, 6.0
+    # Bisection: the rate grows with the bias, which moves by -6 to 6.
+    low = -6.0
+    high = 6.0
     for _ in range(20):
         middle = 0.5 * (low + high)
         bias[0] = unmoved + middle
-        begins = float(policy.lane_chances(choice)[:, 1:].sum(-1).mean())
-        low, high = (middle, high) if begins < wanted else (low, middle)
+        begins = policy.lane_chances(choice)[:, 1:].sum(-1)
+        if float(begins.mean()) < wanted:
+            low = middle
+        else:
+            high = middle
 
 
 class PriorDrivers(NamedTuple):
     """IDM drivers in random scenes, [N, M] each; ``vehicles`` do not accelerate yet.
 
     Attributes:
+        vehicles: where they are, how fast, and where they head for.
         lane: whose centre a driver swings back to, int64; it may head for another one.
-        speed, aside: along and across the road as drawn, m/s.
+        speed: along the road as drawn, m/s.
+        aside: across the road as drawn, m/s.
         headway: that the driver keeps, s.
     """
 
@@ -346,21 +431,36 @@ def prior_drivers(road: Road, scenes: int, random: torch.Generator) -> PriorDriv
 
     Speeds are 0 to 38 m/s, headways around 1.25 s (log-normal, 0.5 to 3 s). The drivers of a scene
     are about equally fast, at a density of its own: 60 to 560 m for all of them.
+
+    Args:
+        road: with three lanes or more.
+        scenes: N, how many there are.
+        random: draws the drivers.
     """
+    # The order of the draws is part of a fit.
     shape = (scenes, PRIOR_VEHICLES)
     rand, randn = draws(shape, random)
     lane = torch.randint(0, 3, shape, generator=random)
+
     # A third of the drivers is somewhere between two lanes.
     astray = rand() < 0.35
-    y = lane * road.lane_width_m + torch.where(astray, 3.2, 0.5) * (rand() - 0.5)
+    spread_m = torch.where(astray, 3.2, 0.5)
+    y = lane * road.lane_width_m + spread_m * (rand() - 0.5)
 
     # The pace [N, 1] of a scene, what drivers differ from it, and a few who stand or crawl.
     pace = 36.0 * rand(scenes, 1) ** 0.8
-    speed = (pace + 6.0 * randn() * rand(scenes, 1)).clamp(0.0, 38.0)
+    apart = 6.0 * randn() * rand(scenes, 1)
+    speed = (pace + apart).clamp(0.0, 38.0)
     speed = torch.where(rand() < 0.08, 3.0 * rand(), speed)
-    # Half of the drivers would like to go as fast as they do, or up to 8 m/s faster.
-    desired = torch.where(rand() < 0.5, 14.0 + 20.0 * rand(), speed + 8.0 * rand())
+
+    # Half of the drivers would like to go as fast as they do, or up to 8 m/s faster; the others
+    # have a wish that does not depend on how fast they are.
+    independent = rand() < 0.5
+    wish = 14.0 + 20.0 * rand()
+    desired = torch.where(independent, wish, speed + 8.0 * rand())
+
     headway = torch.exp(math.log(1.25) + 0.42 * randn()).clamp(0.5, 3.0)
+    # Who is between two lanes moves across the road more.
     aside = torch.where(astray, 0.45, 0.15) * randn()
 
     zero = torch.zeros(shape)
@@ -382,6 +482,10 @@ def prior_drivers(road: Road, scenes: int, random: torch.Generator) -> PriorDriv
 def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[Moves, Tensor]:
     """What recordings do not show: moves of IDM drivers, and lane changes into danger.
 
+    Args:
+        random: draws drivers, and what they have done so far.
+        scenes: how many there are, of :data:`PRIOR_VEHICLES` each.
+
     Returns:
         Moves of the drivers [R] whose situation is rare or missing in recordings, and sides
         [D, SIDE_FEATURES] where a lane change leaves no room.
@@ -391,18 +495,31 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
     rand, randn = draws(speed.shape, random)
 
     # What IDM asks for now, m/s2; drivers did that in part so far, or something else.
-    idm = IdmParameters(comfortable_deceleration=2.0, min_acceleration=-8.0, max_acceleration=1.4)
+    idm = IdmParameters(
+        comfortable_deceleration=2.0,
+        min_acceleration=-8.0,
+        max_acceleration=1.4,
+    )
     wanted = following_acceleration(scene_of(vehicles, road), with_headways(idm, headway))
-    before = torch.where(rand() < 0.5, 0.6 * randn(), (wanted * rand()).clamp(-6.0, 2.0))
+    otherwise = rand() < 0.5
+    something_else = 0.6 * randn()
+    in_part = (wanted * rand()).clamp(-6.0, 2.0)
+    before = torch.where(otherwise, something_else, in_part)
     vehicles = vehicles.with_(acceleration=before)
     view = perceive(vehicles, road)
 
     # A memory that fits to this, up to noise: the style shows the headway, as it does in traffic.
     history = before[..., None] + 0.4 * randn(*speed.shape, ACCELERATIONS)
     history[..., 0] = before
+    style = (
+        torch.log(headway) + 0.2 * randn(),
+        # The mean square of the acceleration, and the pace.
+        0.5 * rand(),
+        0.5 * randn(),
+    )
     memory = Memory(
         accelerations=history,
-        style=torch.stack((torch.log(headway) + 0.2 * randn(), 0.5 * rand(), 0.5 * randn()), -1),
+        style=torch.stack(style, -1),
         lateral_speeds=aside[..., None] + 0.03 * randn(*speed.shape, 2),
         age=12.0 * rand(),
         since=12.0 * rand(),
@@ -411,27 +528,34 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
     situation = Situation(vehicles, memory, road, view)
 
     # Recordings are silent at high speed, at a standstill, on a free road and before a collision.
-    time_to_collision = view.gap / (-view.closing).clamp_min(1e-3)
+    time_to_collision_s = view.gap / (-view.closing).clamp_min(1e-3)
+    headway_now_s = view.gap / speed.clamp_min(1.0)
     silent = (speed > 19.0) | (speed < 1.5) | (view.gap > 80.0)
-    silent |= (time_to_collision < 4.0) | (view.gap / speed.clamp_min(1.0) < 0.5)
+    silent |= (time_to_collision_s < 4.0) | (headway_now_s < 0.5)
     # Few overlap.
-    silent &= ~((view.gap < 0.0) & (rand() < 0.8))
-    far_off = (vehicles.y - road.centre_of(vehicles.target_lane)).abs() > 0.75
+    overlaps = view.gap < 0.0
+    silent &= ~(overlaps & (rand() < 0.8))
+
+    # They show few who are far from the centre of the lane that they head for, m.
+    from_target = vehicles.y - road.centre_of(vehicles.target_lane)
+    far_off = from_target.abs() > 0.75
 
     # Along: half of the way to IDM's acceleration, all of it where that is hard braking.
     hard = wanted < -2.0
     change = torch.where(hard, 1.0, 0.5) * (wanted - before)
     change = change + torch.where(hard, 0.05, 0.18) * randn()
     # Across: back to the lane's centre within some two seconds.
-    back = (-0.45 * (vehicles.y - road.centre_of(lane))).clamp(-0.9, 0.9)
+    from_centre = vehicles.y - road.centre_of(lane)
+    back = (-0.45 * from_centre).clamp(-0.9, 0.9)
     sideways = 0.4 * (back - aside) + 0.03 * randn()
 
     moves = Moves(
-        features_of(situation),
-        change,
-        sideways,
-        silent.float(),
-        torch.where(far_off, 0.5, 0.1),
+        features=features_of(situation),
+        change=change,
+        aside=sideways,
+        weight=silent.float(),
+        lateral_weight=torch.where(far_off, 0.5, 0.1),
     )
     sides = lane_choice(situation).sides
-    return moves.rows(silent | far_off), sides[~leaves_room(sides) & view.exists]
+    danger = sides[~leaves_room(sides) & view.exists]
+    return moves.rows(silent | far_off), danger

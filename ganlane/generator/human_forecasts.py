@@ -7,6 +7,7 @@ on the policy drives everybody in the scene, by expected moves (the mean driver)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -59,34 +60,55 @@ LEFT_OF_ACCELERATION = 0.6
 WIDTH_M = 1.9
 #: Who moves aside faster than this, m/s, away from its lane's centre, is changing lanes.
 CHANGING_MPS = 0.35
-#: Of the observer's fit: shares of the noise, frames between windows, batch and learning rate.
+
+# Of the observer's fit.
+#: Shares of the recorded noise; every scene is used with each of them.
 NOISE_SHARES = (0.0, 0.5, 1.0, 1.2)
-OBSERVER_STRIDE, OBSERVER_BATCH, OBSERVER_RATE = 2, 512, 3e-3
+#: Frames between the starts of two windows.
+OBSERVER_STRIDE = 2
+#: Windows of an update.
+OBSERVER_BATCH = 512
+#: The highest learning rate.
+OBSERVER_RATE = 3e-3
 
 
 def present_of(estimator: Estimator, segments: Segments) -> Situation:
-    """The drivers at the present of segments [B, V].
+    """The drivers at the present of B segments of V vehicles.
 
     Who was not recorded in all of the nine frames has driven at constant velocity so far.
+
+    Args:
+        estimator: finds speeds and accelerations in nine noisy positions.
+        segments: only their observed frames are used.
+
+    Returns:
+        Vehicles, memories and views [B, V]. Desired speeds are not known: they are taken to be
+        :data:`DESIRED_ABOVE_MPS` above the present ones.
     """
     # Nine positions [B, V, 9, 2] of a driver, and whether all of them were recorded.
     whole = segments.present[:, :OBSERVED_POSITIONS].all(1)
     nine = segments.positions[:, :OBSERVED_POSITIONS].transpose(1, 2)
     last = nine[:, :, -1]
 
-    # The motion [B, V, 7] in the order of the estimator's numbers.
-    motion = torch.where(whole[..., None], estimator(nine - last[:, :, None]), 0.0)
+    # The motion [B, V, 7] in the order of the estimator's numbers. All of them are 0 where frames
+    # are missing: no acceleration, and the last position as recorded.
+    estimated = estimator(nine - last[:, :, None])
+    motion = torch.where(whole[..., None], estimated, 0.0)
     latest = (nine[:, :, -1, 0] - nine[:, :, -2, 0]) / PHYSICS_STEP_S
     speed = torch.where(whole, motion[..., 0], latest).clamp_min(0.0)
     aside = motion[..., 3]
+
+    # The last position is noisy, too: the estimator says by how much it is wrong.
     x, y = (last + motion[..., 5:]).unbind(-1)
 
-    # Who moves away from its lane's centre is on its way to the next lane.
+    # Who moves away from its lane's centre is on its way to the next lane. A recording's target
+    # lanes are not asked: they follow from what drivers do later.
     road = segments.road
     lane = road.lane_of(y)
     outwards = (y - road.centre_of(lane)) * aside > 0.1
     leaving = (aside.abs() > CHANGING_MPS) & outwards
     next_lane = lane_after(y, aside, road, 1.5)
+    target_lane = torch.where(leaving, next_lane, lane)
 
     vehicles = cars(
         x,
@@ -97,42 +119,67 @@ def present_of(estimator: Estimator, segments: Segments) -> Situation:
         length=segments.length.clamp_min(1.0),
         width=torch.full_like(x, WIDTH_M),
         desired_speed=(speed + DESIRED_ABOVE_MPS).clamp(*DESIRED_MPS),
-        target_lane=torch.where(leaving, next_lane, lane).long(),
+        target_lane=target_lane.long(),
         valid=segments.present[:, PRESENT],
     )
-    memory = present_memory(motion, torch.where(whole, trust(nine), 0.0))
+
+    # For how many decisions a driver counts as seen: the noisier its positions, the fewer.
+    age = torch.where(whole, trust(nine), 0.0)
+    memory = present_memory(motion, age)
     return situation_of(vehicles, memory, road, first=torch.ones_like(whole))
 
 
 def human_driver(model: HumanModel, samples: int) -> Driver:
-    """A driver of forecasts [1 + ``samples``, B, H, V, 2]: the mean one, then drawn ones.
+    """A driver of forecasts: the mean one, then drawn ones.
 
     Every call of this function begins the same random numbers anew.
+
+    Args:
+        model: a fitted one, whose policy drives everybody in a segment.
+        samples: how many forecasts are drawn beside the mean one.
+
+    Returns:
+        A function of segments, to positions [1 + ``samples``, B, H, V, 2] in m.
     """
     random = torch.Generator().manual_seed(0)
     return partial(_driven, model, samples, random)
 
 
-def _driven(model: HumanModel, samples: int, random: torch.Generator, segments: Segments) -> Tensor:
-    """Positions [1 + samples, B, H, V, 2] in m; the first are the mean driver's."""
+def _driven(
+    model: HumanModel,
+    samples: int,
+    random: torch.Generator,
+    segments: Segments,
+) -> Tensor:
+    """Positions [1 + samples, B, H, V, 2] in m; the first are the mean driver's.
+
+    All drivers of a run move together, so that they react to each other's forecasts.
+    """
     policy = model.policy
     horizon = segments.future.shape[1]
 
     # All runs are rows of one batch [N, V], N = runs * rows. The first copy of the segments makes
     # the expected moves, the others draw theirs.
-    runs, rows = 1 + samples, len(segments.positions)
+    runs = 1 + samples
+    rows = len(segments.positions)
     situation = present_of(model.estimator, segments.repeated(runs))
     mean = torch.zeros_like(situation.vehicles.valid)
     mean[:rows] = True
+
+    # Who leads the scene at the present counts as its leader throughout.
     leads = situation.view.gap >= SIGHT_M
 
     # Times within a decision [4, 1, 1], s.
     steps = (torch.arange(1, STEPS + 1) * PHYSICS_STEP_S)[:, None, None]
     half = 0.5 * steps**2
+
+    # As many decisions as cover the horizon; the last one may end after it.
+    decisions = math.ceil(horizon / STEPS)
     course = []
-    for _ in range(-(-horizon // STEPS)):
+    for _ in range(decisions):
         # Lanes: the mean driver goes on as it does.
-        chances = policy.lane_chances(lane_choice(situation), HumanVariation.lane_changes)
+        lanes = lane_choice(situation)
+        chances = policy.lane_chances(lanes, HumanVariation.lane_changes)
         u = torch.rand(mean.shape, generator=random)
         choice = chosen(chances, u).masked_fill(mean, 0)
         situation = with_choice(situation, choice)
@@ -144,7 +191,7 @@ def _driven(model: HumanModel, samples: int, random: torch.Generator, segments: 
             drawn = tokens.sample(logits, u, HumanVariation.temperature)
             changes.append(torch.where(mean, tokens.mean(logits), drawn))
 
-        # A policy that sees no leader would speed up.
+        # A policy that sees no leader would speed up. What it does now only fades.
         vehicles, memory, road, view = situation
         fading = (LEFT_OF_ACCELERATION - 1.0) * memory.accelerations[..., 0]
         changes[0] = torch.where(leads, fading, changes[0])
@@ -157,29 +204,40 @@ def _driven(model: HumanModel, samples: int, random: torch.Generator, segments: 
 
         later = moved(vehicles, acceleration, aside)
         situation = situation_of(later, remembered(situation, acceleration), road)
-    positions = torch.cat(course)[:horizon].transpose(0, 1).unflatten(0, (runs, rows))
+
+    # [H, N, V, 2] -> [runs, B, H, V, 2].
+    positions = torch.cat(course)[:horizon]
+    positions = positions.transpose(0, 1).unflatten(0, (runs, rows))
     return positions + _seen_besides(model, segments, positions[0])
 
 
 def _seen_besides(model: HumanModel, segments: Segments, mean: Tensor) -> Tensor:
-    """What the observer adds to positions, [B, H, V, 2] in m; ``mean`` are the mean driver's.
+    """What the observer adds to positions, [B, H, V, 2] in m.
 
-    All of it in the 0.8 s that it was fitted to; 0.8 s later it has faded.
+    All of it in the 0.8 s that it was fitted to; 0.8 s later it has faded. Runs have it in common:
+    a camera's errors do not depend on what a driver decides.
+
+    Args:
+        model: whose observer is asked.
+        segments: with the observed positions.
+        mean: the mean driver's positions, [B, H, V, 2] in m.
     """
     # Per driver and relative to its present place, as the observer expects: [B, V, 9 or 8, 2].
     nine = segments.positions[:, :OBSERVED_POSITIONS].transpose(1, 2)
     ahead = mean[:, :PREDICTED_STEPS].transpose(1, 2)
     present = nine[:, :, -1:]
-    difference = model.observer(nine - present, ahead - present).transpose(1, 2)
+    difference = model.observer(nine - present, ahead - present)
 
-    # Nothing for a driver who was not recorded in all nine frames.
+    # Per step again, [B, 8, V, 2]. Nothing for a driver who was not recorded in all nine frames.
     whole = segments.present[:, :OBSERVED_POSITIONS].all(1)
+    difference = difference.transpose(1, 2)
     difference = torch.where(whole[:, None, :, None], difference, 0.0)
 
     # The last difference goes on, with a share that falls from 1 to 0.
     step = torch.arange(mean.shape[1])
     share = (2.0 - (step + 1) / PREDICTED_STEPS).clamp(0.0, 1.0)
-    return share[:, None, None] * difference[:, step.clamp_max(PREDICTED_STEPS - 1)]
+    fitted_step = step.clamp_max(PREDICTED_STEPS - 1)
+    return share[:, None, None] * difference[:, fitted_step]
 
 
 def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanConfig) -> None:
@@ -196,6 +254,7 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
     random = torch.Generator().manual_seed(config.seed)
 
     def recorded_and_driven(segments: Segments) -> Tensor:
+        """Positions [1, B, 9 + 8 + 8, V, 2]: the recorded ones, then those of the mean driver."""
         mean = _driven(model, 0, random, segments)
         return torch.cat((segments.positions[None], mean), 2)
 
@@ -204,6 +263,7 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
     for parameter in model.observer.layers[-1].parameters():
         nn.init.zeros_(parameter)
 
+    # The noise is what smoothing takes away.
     smoothed = [smooth_scene(scene, config) for scene in scenes]
     noisy = []
     for share in NOISE_SHARES:
@@ -213,10 +273,16 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
             noisy.append(replace(scene, x=x, y=y))
 
     # Windows [W, 9 + 8 + 8, 2]: observed positions, the recorded next ones, and the forecast.
-    (windows,) = driven_windows(recorded_and_driven, noisy, PREDICTED_STEPS, OBSERVER_STRIDE)
+    (windows,) = driven_windows(
+        recorded_and_driven,
+        noisy,
+        PREDICTED_STEPS,
+        OBSERVER_STRIDE,
+    )
     parts = (OBSERVED_POSITIONS, PREDICTED_STEPS, PREDICTED_STEPS)
     positions, wanted, forecast = torch.from_numpy(windows).float().split(parts, 1)
 
+    # What is learnt is the recorded position less the forecast one.
     optimizer = torch.optim.AdamW(model.observer.parameters(), OBSERVER_RATE, weight_decay=1e-2)
     for update in range(config.observing):
         optimizer.param_groups[0]["lr"] = OBSERVER_RATE * half_cosine(update, config.observing)
@@ -225,8 +291,10 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
         # Left and right swapped in half of the rows; x stays: factors [B, 1, 2].
         side = random_sides(OBSERVER_BATCH, random)
         mirror = torch.stack((torch.ones_like(side), side), -1)
-        seen, ahead = mirror * positions[rows], mirror * forecast[rows]
+        seen = mirror * positions[rows]
+        ahead = mirror * forecast[rows]
         missed = mirror * wanted[rows] - ahead
+
         difference = model.observer(seen, ahead) - missed
         descend(optimizer, error_in(difference, DIFFERENCE_SCALE))
     model.observer.requires_grad_(False)

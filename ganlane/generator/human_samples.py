@@ -106,13 +106,22 @@ def smooth(track: Floats, cutoff_hz: float) -> Floats:
     # Four of them hold nearly all of its weight.
     reach = min(len(track) - 1, int(4.0 * frames) + 1)
     longer = np.pad(track, reach, "reflect", reflect_type="odd")
-    return gaussian_filter1d(longer, frames)[reach : reach + len(track)]
+    smoothed = gaussian_filter1d(longer, frames)
+    return smoothed[reach : reach + len(track)]
 
 
 def smooth_scene(recording: Recording, config: HumanConfig, weight: float = 1.0) -> SmoothScene:
-    """The recording smoothed, with the drivers' target lanes; ``weight`` is that of its samples."""
-    x, y = recording.x.copy(), recording.y.copy()
-    speed, lateral_speed = np.zeros_like(x), np.zeros_like(y)
+    """The recording smoothed, with the drivers' target lanes.
+
+    Args:
+        recording: positions at 10 Hz, m.
+        config: the cutoff frequencies along and across the road.
+        weight: of the scene's samples in the fit.
+    """
+    x = recording.x.copy()
+    y = recording.y.copy()
+    speed = np.zeros_like(x)
+    lateral_speed = np.zeros_like(y)
     target = np.zeros(x.shape, np.int64)
 
     for track in range(x.shape[1]):
@@ -126,12 +135,16 @@ def smooth_scene(recording: Recording, config: HumanConfig, weight: float = 1.0)
             speed[part] = np.gradient(x[part], PHYSICS_STEP_S).clip(0.0)
             lateral_speed[part] = np.gradient(y[part], PHYSICS_STEP_S)
         target[part] = target_lanes(
-            y[part], lateral_speed[part], recording.lane_width_m, recording.lanes
+            y[part],
+            lateral_speed[part],
+            recording.lane_width_m,
+            recording.lanes,
         )
 
     same = {part.name: getattr(recording, part.name) for part in fields(Recording)}
+    same |= {"x": x, "y": y, "speed": speed}
     return SmoothScene(
-        **same | {"x": x, "y": y, "speed": speed},
+        **same,
         raw_x=recording.x,
         raw_y=recording.y,
         lateral_speed=lateral_speed,
@@ -154,7 +167,12 @@ def without_noise(recording: Recording, config: HumanConfig) -> SmoothScene:
     return replace(scene, raw_x=scene.x, raw_y=scene.y)
 
 
-def target_lanes(y: Floats, lateral_speed: Floats, width_m: float, lanes: int) -> np.ndarray:
+def target_lanes(
+    y: Floats,
+    lateral_speed: Floats,
+    width_m: float,
+    lanes: int,
+) -> np.ndarray:
     """The lane [T] that a driver heads for: from the start of a change on the new one.
 
     A change counts if the track stays for 0.5 s in each of the two lanes.
@@ -170,7 +188,10 @@ def target_lanes(y: Floats, lateral_speed: Floats, width_m: float, lanes: int) -
 
     # The last frames before the track crosses from one lane to another.
     for last in np.flatnonzero(np.diff(lane)):
-        old, new = lane[last], lane[last + 1]
+        old = lane[last]
+        new = lane[last + 1]
+
+        # Five frames, 0.5 s, in each of the two lanes.
         before = lane[max(0, last - 4) : last + 1]
         after = lane[last + 1 : last + 6]
         if (before != old).any() or (after != new).any():
@@ -195,14 +216,19 @@ class Segments(NamedTuple):
     :data:`HISTORY`.
 
     Attributes:
-        x, y: smoothed places along and across the road, m, [B, T, M]; ``raw_x`` and ``raw_y`` are
-            the recorded ones.
-        speed, lateral_speed: m/s, [B, T, M].
+        x: smoothed place along the road, m, [B, T, M].
+        y: smoothed place across the road, m, [B, T, M].
+        raw_x: place along the road as recorded, m, [B, T, M].
+        raw_y: place across the road as recorded, m, [B, T, M].
+        speed: along the road, m/s, [B, T, M].
+        lateral_speed: across the road, m/s, [B, T, M].
         target: lane that the driver heads for, [B, T, M].
         present: who is in the recording, [B, T, M].
-        length, width: of the bodies, m, [B, M].
+        length: of the bodies, m, [B, M].
+        width: of the bodies, m, [B, M].
         driven: [B, M]; the other vehicles move as recorded and are in no sample.
-        lanes, lane_width_m: of the roads, [B, 1]; the width in m.
+        lanes: how many the roads have, [B, 1].
+        lane_width_m: [B, 1].
         weight: of the samples, [B, 1].
     """
 
@@ -233,11 +259,13 @@ class Segments(NamedTuple):
 
     def mirrored(self) -> Segments:
         """Left and right swapped."""
+        # The leftmost lane becomes lane 0, whose centre is at y = 0.
         last = (self.lanes - 1)[:, None]
-        left = last * self.lane_width_m[:, None]
+        leftmost_m = last * self.lane_width_m[:, None]
+        # Entries of absent vehicles stay 0.
         return self._replace(
-            y=torch.where(self.present, left - self.y, self.y),
-            raw_y=torch.where(self.present, left - self.raw_y, self.raw_y),
+            y=torch.where(self.present, leftmost_m - self.y, self.y),
+            raw_y=torch.where(self.present, leftmost_m - self.raw_y, self.raw_y),
             target=torch.where(self.present, last.long() - self.target, 0),
             lateral_speed=-self.lateral_speed,
         )
@@ -246,7 +274,9 @@ class Segments(NamedTuple):
         """Lengths along the road times ``factor`` [B, 1]; cars keep theirs, headways stay."""
         by = factor[:, None]
         x = self.x * by
-        return self._replace(x=x, raw_x=x + (self.raw_x - self.x), speed=self.speed * by)
+        # The noise is the camera's, and stays as large.
+        noise = self.raw_x - self.x
+        return self._replace(x=x, raw_x=x + noise, speed=self.speed * by)
 
     def widened(self, factor: Tensor) -> Segments:
         """Lanes and lateral moves times ``factor`` [B, 1]."""
@@ -298,14 +328,22 @@ IN_FRAMES = ("x", "y", "raw_x", "raw_y", "speed", "lateral_speed", "target", "pr
 
 
 def cuts(scenes: Sequence[SmoothScene], decisions: int, stride: int) -> list[Cut]:
-    """Stretches of ``decisions`` that begin every ``stride`` frames, with their history before."""
+    """Stretches of the scenes, which overlap.
+
+    Args:
+        scenes: smoothed ones.
+        decisions: of 0.4 s, that a stretch has; its history comes before them.
+        stride: frames between the starts of two stretches.
+    """
     # The last decision needs what followed it.
     present_frames = STEPS * (decisions + 1) + 1
     frames = HISTORY + present_frames
+
     stretches = []
     for scene in scenes:
         # A stretch may end after its scene, which has three more moves at least if it is that long.
-        for start in range(0, max(1, len(scene.x) - STEPS * 3), stride):
+        end = max(1, len(scene.x) - STEPS * 3)
+        for start in range(0, end, stride):
             who = scene.present[start : start + present_frames].any(0)
             if who.any():
                 stretches.append(Cut(scene, start - HISTORY, frames, np.flatnonzero(who)))
@@ -313,7 +351,10 @@ def cuts(scenes: Sequence[SmoothScene], decisions: int, stride: int) -> list[Cut
 
 
 def batches(stretches: Sequence[Cut]) -> Iterator[Segments]:
-    """The stretches side by side, those with about as many vehicles together."""
+    """The stretches side by side, those with about as many vehicles together.
+
+    Drivers see each other in pairs, so the pairs in a batch are what is bounded.
+    """
     waiting: list[Cut] = []
     for stretch in sorted(stretches, key=lambda cut: len(cut.who)):
         # The newest is the widest, to which the others are filled up.
@@ -330,12 +371,20 @@ def segments_of(stretches: Sequence[Cut]) -> Segments:
     """The stretches as one batch; frames outside of their scenes are absent."""
 
     def column(name: str) -> Tensor:
-        return torch.tensor([[getattr(cut.scene, name)] for cut in stretches], dtype=torch.float32)
+        """A number of every scene, [B, 1]."""
+        values = [[getattr(cut.scene, name)] for cut in stretches]
+        return torch.tensor(values, dtype=torch.float32)
 
     def of_vehicles(name: str, filler: float) -> Tensor:
-        return side_by_side([getattr(cut.scene, name)[cut.who] for cut in stretches], filler)
+        """A field of the vehicles, [B, M]."""
+        values = [getattr(cut.scene, name)[cut.who] for cut in stretches]
+        return side_by_side(values, filler)
 
-    in_frames = {name: side_by_side([cut.field(name) for cut in stretches]) for name in IN_FRAMES}
+    in_frames = {}
+    for name in IN_FRAMES:
+        values = [cut.field(name) for cut in stretches]
+        in_frames[name] = side_by_side(values)
+
     return Segments(
         **in_frames,
         # Finite sizes for those that fill the batch.
@@ -351,23 +400,32 @@ def segments_of(stretches: Sequence[Cut]) -> Segments:
 def recorded(segments: Segments, decision: int, desired: Tensor) -> tuple[Vehicles, Memory]:
     """Vehicles and memories [B, M] as recorded at a decision; style and closing speeds are empty.
 
-    ``desired`` [B, M] are the desired speeds, m/s.
+    Args:
+        segments: B stretches of scenes.
+        decision: its number, from 0 on.
+        desired: speeds that the drivers wish for, m/s, [B, M].
     """
     # The present, and the decisions before it, newest first: [B, 1 + ACCELERATIONS, M].
     frames = HISTORY + STEPS * (decision - torch.arange(ACCELERATIONS + 1))
     now = frames[0]
-    speed, aside = segments.speed[:, frames], segments.lateral_speed[:, frames]
+    speed = segments.speed[:, frames]
+    aside = segments.lateral_speed[:, frames]
     present = segments.present[:, frames]
 
     # Mean accelerations between two decisions, as far back as the driver was recorded.
     without_gap = present.cumprod(1)[:, 1:]
     changes = (speed[:, :-1] - speed[:, 1:]) / DECISION_S
-    accelerations = torch.where(without_gap > 0, changes, 0.0).movedim(1, -1)
+    accelerations = torch.where(without_gap > 0, changes, 0.0)
     age = without_gap.sum(1).to(speed.dtype)
 
     # Where nothing was recorded, the present lateral speed.
     past = slice(1, LATERAL_SPEEDS + 1)
-    lateral_speeds = torch.where(present[:, past], aside[:, past], aside[:, :1]).movedim(1, -1)
+    lateral_speeds = torch.where(present[:, past], aside[:, past], aside[:, :1])
+
+    # The memory has the decisions in its last dimension.
+    accelerations = accelerations.movedim(1, -1)
+    lateral_speeds = lateral_speeds.movedim(1, -1)
+    memory = memory_of(accelerations, lateral_speeds, age)
 
     vehicles = cars(
         segments.x[:, now],
@@ -381,7 +439,7 @@ def recorded(segments: Segments, decision: int, desired: Tensor) -> tuple[Vehicl
         target_lane=segments.target[:, now],
         valid=present[:, 0],
     )
-    return vehicles, memory_of(accelerations, lateral_speeds, age)
+    return vehicles, memory
 
 
 class Moves(NamedTuple):
@@ -389,9 +447,10 @@ class Moves(NamedTuple):
 
     Attributes:
         features: [R, FEATURES] what drivers perceive.
-        change, aside: [R] of the acceleration, m/s2, and of the lateral speed, m/s, that should
-            follow.
-        weight, lateral_weight: [R] of the sample in the fit of either.
+        change: [R] of the acceleration that should follow, m/s2.
+        aside: [R] change of the lateral speed that should follow, m/s.
+        weight: [R] of the sample in the fit of the acceleration.
+        lateral_weight: [R] of the sample in the fit of the lateral speed.
     """
 
     features: Tensor
@@ -412,8 +471,9 @@ class Choices(NamedTuple):
         sides: of drivers that could begin a lane change on a side, or are on one,
             [S, SIDE_FEATURES].
         begins: [S] 1 where it begins, 0 where not, -1 where a change is under way.
-        keeping_sides, keeping_exists: [K, 2, ...] of drivers in their lanes, as in
+        keeping_sides: [K, 2, SIDE_FEATURES] both sides of drivers in their lanes, as in
             :class:`~ganlane.generator.human.LaneChoice`.
+        keeping_exists: [K, 2] whether these drivers have lanes there.
     """
 
     sides: Tensor
@@ -423,9 +483,14 @@ class Choices(NamedTuple):
 
     def keeping(self, rows: Tensor | slice) -> LaneChoice:
         """The lane choices of ``rows`` of the drivers who are in their lanes."""
-        sides, exists = self.keeping_sides[rows], self.keeping_exists[rows]
+        sides = self.keeping_sides[rows]
         yes = torch.ones(len(sides), dtype=torch.bool)
-        return LaneChoice(sides, exists, yes, ~yes)
+        return LaneChoice(
+            sides=sides,
+            exists=self.keeping_exists[rows],
+            keeping=yes,
+            to_left=~yes,
+        )
 
 
 class Samples(NamedTuple):
@@ -472,9 +537,12 @@ def samples_of(stretches: Sequence[Cut], options: Options, random: torch.Generat
 def _samples(segments: Segments, options: Options, random: torch.Generator) -> Samples:
     """Samples of one batch: its vehicles are driven from decision to decision."""
     segments = varied(segments, options, random)
+
+    # Desired speeds [B, M], m/s: what a driver has shown at most, and more.
     top = torch.where(segments.present, segments.speed, 0.0).amax(1)
     above = DESIRED_ABOVE_MPS * torch.rand(top.shape, generator=random)
     desired = (top + above).clamp(*DESIRED_MPS)
+
     # A policy for single lanes, too, has to do without the sides now and then.
     sides_seen = not (options.blind and torch.rand((), generator=random) < options.blind)
 
@@ -484,9 +552,12 @@ def _samples(segments: Segments, options: Options, random: torch.Generator) -> S
 
     closed_loop = options.policy is not None
     driven = segments.driven & closed_loop
+    two_dimensional = segments.two_dimensional
+
     parts = []
     decisions = (segments.x.shape[1] - HISTORY - 1) // STEPS - 1
     for decision in range(decisions):
+        # Where everybody is: as recorded, or as driven so far.
         as_recorded = recorded(segments, decision, desired)
         vehicles, memory, first = _with_recorded(vehicles, memory, *as_recorded, driven)
         if options.estimator is not None and decision == 0:
@@ -497,21 +568,27 @@ def _samples(segments: Segments, options: Options, random: torch.Generator) -> S
         # What should follow: the recorded move, corrected towards the recording.
         now = HISTORY + STEPS * decision
         change, aside = _led_back(segments, now, situation)
-        follows = segments.present[:, now + STEPS] & vehicles.valid & segments.driven
-        # A driver that has just come knows no acceleration of its own yet.
-        counts = follows if closed_loop else follows & (memory.age > 0)
         weight = segments.weight.expand_as(change)
-        moves = Moves(features, change, aside, weight, weight * segments.two_dimensional)
+        moves = Moves(features, change, aside, weight, weight * two_dimensional)
+
+        # Of drivers who are there until the next decision. Without a policy, one that has just come
+        # knows no acceleration of its own yet.
+        follows = segments.present[:, now + STEPS] & vehicles.valid & segments.driven
+        counts = follows
+        if not closed_loop:
+            counts = follows & (memory.age > 0)
 
         # Whether the target lane changes until the next decision.
         step = segments.target[:, now + STEPS] - vehicles.target_lane
-        choices = _choices(lane_choice(situation), follows & segments.two_dimensional, step)
+        choices = _choices(lane_choice(situation), follows & two_dimensional, step)
         parts.append(Samples(moves.rows(counts), choices))
 
         # In closed loop the policy makes the move itself, so that it sees its own mistakes.
         if closed_loop:
             change, aside = _nearest_move(options, features, change, aside, random)
-            aside = torch.where(segments.two_dimensional, aside, 0.0)
+            aside = torch.where(two_dimensional, aside, 0.0)
+
+        # A decision later.
         acceleration, lateral = bounded(situation, change, aside)
         memory = remembered(situation, acceleration)
         vehicles = moved(vehicles, acceleration, lateral)
@@ -527,10 +604,18 @@ def _with_recorded(
 ) -> tuple[Vehicles, Memory, Tensor]:
     """Vehicles and memories [B, M] at a decision, and who is there for the first time.
 
-    Who has just come, and who is not ``driven`` [B, M], is as recorded. All head for the lanes that
-    they headed for in the recording.
+    Who has just come, and who is not driven, is as recorded. All head for the lanes that they
+    headed for in the recording.
+
+    Args:
+        vehicles: as driven so far, [B, M].
+        memory: what they remember.
+        recorded_vehicles: at the decision, [B, M].
+        recorded_memory: theirs.
+        driven: whom the policy drives, [B, M].
     """
-    present, target = recorded_vehicles.valid, recorded_vehicles.target_lane
+    present = recorded_vehicles.valid
+    target = recorded_vehicles.target_lane
     first = present & ~vehicles.valid
     replaced = present & (first | ~driven)
 
@@ -557,9 +642,11 @@ def _estimated(
     whole = segments.present[:, nine].all(1) & segments.driven
 
     # Positions [B, M, 9, 2], m: the smoothed ones, and a share of the recorded noise.
-    noise = noise_shares(len(segments.x), 0.2, 0.7, random)
-    x = segments.x[:, nine] + noise * (segments.raw_x - segments.x)[:, nine]
-    y = segments.y[:, nine] + noise * (segments.raw_y - segments.y)[:, nine]
+    share = noise_shares(len(segments.x), 0.2, 0.7, random)
+    noise_x = (segments.raw_x - segments.x)[:, nine]
+    noise_y = (segments.raw_y - segments.y)[:, nine]
+    x = segments.x[:, nine] + share * noise_x
+    y = segments.y[:, nine] + share * noise_y
     positions = torch.stack((x, y), -1).transpose(1, 2)
 
     # The motion [B, M, 7] is speed, two accelerations, two lateral speeds, and where the driver is
@@ -569,9 +656,12 @@ def _estimated(
     x, y = (last + motion[..., 5:]).unbind(-1)
     seen = vehicles.with_(x=x, y=y, acceleration=motion[..., 1])
     seen = with_velocity(seen, motion[..., 0].clamp_min(0.0), motion[..., 3])
-
     seen_memory = present_memory(motion, trust(positions))
-    return seen.where(whole, vehicles), _taken(memory, seen_memory, whole)
+
+    # The others stay as they are.
+    vehicles = seen.where(whole, vehicles)
+    memory = _taken(memory, seen_memory, whole)
+    return vehicles, memory
 
 
 def varied(segments: Segments, options: Options, random: torch.Generator) -> Segments:
@@ -589,8 +679,11 @@ def varied(segments: Segments, options: Options, random: torch.Generator) -> Seg
 
 
 def draws(shape: tuple[int, ...], random: torch.Generator) -> tuple[Draw, Draw]:
-    """Functions that draw uniform and standard normal numbers, of this shape or of another one
-    that they are asked for.
+    """Functions that draw uniform and standard normal numbers.
+
+    Args:
+        shape: of the numbers, unless the functions are asked for another one.
+        random: that they draw from, in the order of the calls.
     """
 
     def rand(*size: int) -> Tensor:
@@ -604,6 +697,7 @@ def draws(shape: tuple[int, ...], random: torch.Generator) -> tuple[Draw, Draw]:
 
 def _taken(memory: Memory, other: Memory, where: Tensor) -> Memory:
     """The memory with accelerations, lateral speeds and age of ``other`` at ``where`` [B, M]."""
+    # For what a driver has several numbers of.
     many = where[..., None]
     return memory._replace(
         accelerations=torch.where(many, other.accelerations, memory.accelerations),
@@ -617,40 +711,61 @@ def _led_back(segments: Segments, now: int, situation: Situation) -> tuple[Tenso
     frame ``now`` on, or lead back to it.
     """
     vehicles, memory, _, view = situation
+    later = now + STEPS
 
     # A proportional controller on top of the recorded motion.
-    recorded_acceleration = (segments.speed[:, now + STEPS] - segments.speed[:, now]) / DECISION_S
-    for_speed = SPEED_GAIN * (segments.speed[:, now] - view.speed)
+    speed = segments.speed[:, now]
+    recorded_acceleration = (segments.speed[:, later] - speed) / DECISION_S
+    for_speed = SPEED_GAIN * (speed - view.speed)
     for_place = PLACE_GAIN * (segments.x[:, now] - vehicles.x)
     wanted = recorded_acceleration + for_speed + for_place
     wanted = wanted.clamp(HARDEST_BRAKING, STRONGEST_ACCELERATION)
+    change = wanted - memory.accelerations[..., 0]
 
+    # The same across the road, where a decision sets the speed.
     for_place_across = LATERAL_GAIN * (segments.y[:, now] - vehicles.y)
-    wanted_aside = segments.lateral_speed[:, now + STEPS] + for_place_across
-    return wanted - memory.accelerations[..., 0], wanted_aside - view.aside
+    wanted_aside = segments.lateral_speed[:, later] + for_place_across
+    return change, wanted_aside - view.aside
 
 
 def _nearest_move(
-    options: Options, features: Tensor, change: Tensor, aside: Tensor, random: torch.Generator
+    options: Options,
+    features: Tensor,
+    change: Tensor,
+    aside: Tensor,
+    random: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Of several moves that the policy draws, the nearest ones to ``change`` and ``aside`` [B, M],
-    for each of the two alone.
+    """Of several moves that the policy draws, the nearest to a wanted one, along and across alone.
+
+    Args:
+        options: the policy, and how many moves it draws.
+        features: what drivers perceive, [B, M, FEATURES].
+        change: of the acceleration that is wanted, m/s2, [B, M].
+        aside: change of the lateral speed that is wanted, m/s, [B, M].
+        random: draws the moves.
     """
     assert options.policy is not None
     logits_of_both = options.policy(features)
     nearest = []
     for tokens, logits, wanted in zip((ALONG, ACROSS), logits_of_both, (change, aside)):
-        # [samples, B, M] values, the index of the best one of each driver [1, B, M].
+        # Values [samples, B, M].
         u = torch.rand((options.samples, *wanted.shape), generator=random)
-        drawn = tokens.sample(logits.expand(options.samples, *logits.shape), u)
+        repeated = logits.expand(options.samples, *logits.shape)
+        drawn = tokens.sample(repeated, u)
+
+        # The index of the best one of each driver, [1, B, M].
         best = (drawn - wanted).abs().argmin(0, keepdim=True)
         nearest.append(drawn.gather(0, best)[0])
     return nearest[0], nearest[1]
 
 
 def _choices(choice: LaneChoice, counts: Tensor, step: Tensor) -> Choices:
-    """What was chosen at one decision by the drivers who count (``counts`` [N, M]), whose target
-    lanes change by ``step`` [N, M] until the next one.
+    """What drivers chose at one decision.
+
+    Args:
+        choice: what they could do, [N, M].
+        counts: who of them is in the samples, [N, M].
+        step: by how many lanes their target lanes change until the next decision, [N, M].
     """
     # A change begins at the decision after which the target lane is another one: to the left, to
     # the right, [N, M, 2].
@@ -663,6 +778,11 @@ def _choices(choice: LaneChoice, counts: Tensor, step: Tensor) -> Choices:
     left, right = choice.sides.unbind(-2)
     aside = torch.where(choice.to_left[..., None], left, right)[under_way]
 
-    sides = torch.cat((choice.sides[could], aside))
-    labels = torch.cat((begins[could].float(), torch.full((len(aside),), -1.0)))
-    return Choices(sides, labels, choice.sides[keeping], choice.exists[keeping])
+    # First those who could begin one, then those who are on their way.
+    labels = (begins[could].float(), torch.full((len(aside),), -1.0))
+    return Choices(
+        sides=torch.cat((choice.sides[could], aside)),
+        begins=torch.cat(labels),
+        keeping_sides=choice.sides[keeping],
+        keeping_exists=choice.exists[keeping],
+    )

@@ -48,7 +48,8 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
 
 def short_report(prepared: PooledStatistics) -> str:
     """Rows, exposure, lane-change rates and durations in a few lines."""
-    exposure, count = prepared.exposure, prepared.count
+    exposure = prepared.exposure
+    count = prepared.count
     # What was read and dropped first: a wrong format shows there.
     lines = [f"rows: {count.read:,} read, {count.kept:,} kept, {prepared.written:,} written"]
     lines += [f"dropped: {rows:,} ({reason})" for reason, rows in count.dropped.most_common()]

@@ -62,6 +62,7 @@ def short_report(prepared: PooledStatistics) -> str:
 
 
 def _lane_change_lines(prepared: PooledStatistics) -> list[str]:
+    """Their rates, and their duration where it is known."""
     changes = prepared.lane_changes
     duration = changes.duration
     complete = duration.complete
@@ -85,6 +86,7 @@ def _lane_change_lines(prepared: PooledStatistics) -> list[str]:
 
 
 def _acceleration_lines(prepared: PooledStatistics) -> list[str]:
+    """Share of strong accelerations; no line without any acceleration."""
     parts = []
     # Raw ones are mostly noise of the measurement; both are shown, so that this shows.
     for name, title in (("raw", "as recorded"), ("smoothed", "over 1 s")):

@@ -75,20 +75,17 @@ class Recording:
         frames = int(time.max()) + 1
         tracks = int(track.max()) + 1
 
-        def placed(name: str, shape: tuple[int, ...], at: Any) -> Any:
-            """A column's values at the places ``at`` of an array of zeros."""
-            column = rows[name].to_numpy()
-            array = np.zeros(shape, column.dtype)
-            array[at] = column
-            return array
-
         arrays: dict[str, Any] = {}
         # 0 where a track is absent.
         for name in _OF_SAMPLES:
-            arrays[name] = placed(name, (frames, tracks), (time, track))
+            column = rows[name].to_numpy()
+            arrays[name] = np.zeros((frames, tracks), column.dtype)
+            arrays[name][time, track] = column
         # Values per track are the same in all of its rows.
         for name in _OF_TRACKS:
-            arrays[name] = placed(name, (tracks,), track)
+            column = rows[name].to_numpy()
+            arrays[name] = np.zeros(tracks, column.dtype)
+            arrays[name][track] = column
 
         scene = str(rows["scene"][0])
         # Lane 0 is the rightmost; lanes beyond the leftmost one in use are not known.

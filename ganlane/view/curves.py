@@ -42,8 +42,9 @@ def read_metrics(path: str | Path) -> pl.DataFrame:
         UserError: no such file, it cannot be read, it holds text, or it has no column ``decisions``
             or no rows.
     """
-    path = Path(path)
-    file = path / "metrics.csv" if path.is_dir() else path
+    file = Path(path)
+    if file.is_dir():
+        file = file / "metrics.csv"
     try:
         # Types are inferred from all rows: a column may be empty for the first thousands.
         frame = pl.read_csv(file, infer_schema_length=None)

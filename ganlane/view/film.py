@@ -148,16 +148,9 @@ def _write_mp4(painter: FramePainter, frames: Sequence[int], path: Path) -> None
     rate = Fraction(look.fps).limit_denominator()
     # Pictures come as plain bytes through its standard input.
     raw = f"-f rawvideo -pix_fmt rgb24 -s {look.width}x{look.height} -r {rate} -i -"
+    options = f"-y -v error {raw} {_H264}".split()
     with atomic_path(path) as part:
-        words = [
-            ffmpeg,
-            "-y",
-            "-v",
-            "error",
-            *raw.split(),
-            *_H264.split(),
-            str(part),
-        ]
+        words = [ffmpeg, *options, str(part)]
         # In a session of its own, so that Ctrl-C reaches this process alone. ffmpeg ends with its
         # input.
         with Popen(words, stdin=PIPE, stderr=PIPE, start_new_session=True) as program:

@@ -155,8 +155,7 @@ class FramePainter:
         shown = np.flatnonzero(begins & ends & trajectory.valid[frame])
         # The ego comes last, on top of the others.
         for vehicle in shown[::-1].tolist():
-            column = float(columns[vehicle])
-            self._draw_vehicle(picture, frame, vehicle, column)
+            self._draw_vehicle(picture, frame, vehicle, float(columns[vehicle]))
 
         if frame == len(trajectory) - 1:
             self._draw_outcome(picture, float(columns[0]))

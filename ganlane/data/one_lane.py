@@ -28,6 +28,7 @@ ONE_LANE_FILES = {
     "I-80, following": "i80_following.csv",
     "I-24": "../i24/instrumented.csv",
 }
+#: Length of a segment, s.
 SEGMENT_S = 15.0
 #: The first seconds of a pair, in which the published smoothing bends the follower's speed, s.
 EDGE_S = 3.0

@@ -32,6 +32,7 @@ from ganlane.settings.generator import NgsimParameters
 
 #: Accelerations beyond it, which few cars reach, are strong, m/s2.
 _STRONG_MPS2 = 3.0
+#: Those of the :func:`quantities` that may be strong.
 _ACCELERATIONS = ("acceleration_raw", "acceleration_smoothed")
 
 
@@ -52,6 +53,7 @@ class PooledStatistics:
         self.written = 0
         self.files: list[str] = []
         self.scenes: list[dict[str, Any]] = []
+        # Of each scene, in the order in which they were added.
         self._exposures: list[Exposure] = []
         self._changes: list[LaneChanges] = []
         self._samples: list[dict[str, np.ndarray]] = []
@@ -123,7 +125,13 @@ class PooledStatistics:
         return float(strong.mean()) if len(strong) else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain numbers and dataclasses, for ``results.json``."""
+        """Everything as plain numbers and dataclasses, for ``results.json``.
+
+        Returns:
+            ``rows`` (read, kept, dropped by reason, written), ``files``, ``exposure``,
+            ``lane_changes``, a distribution of each of the :func:`quantities`, shares of strong
+            accelerations, and ``scenes``.
+        """
         rows = {
             "read": self.count.read,
             "kept": self.count.kept,

@@ -229,6 +229,8 @@ def record_episode(
 ) -> Trajectory:
     """Drive one episode to its end and record it at every physics step.
 
+    The environment's own recorder, if it has one, rests meanwhile.
+
     Args:
         env: batched environment; all rows run the episode, row 0 is recorded. One row is enough.
         policy: writes ``action``; acts deterministically.
@@ -259,6 +261,7 @@ def record_episode(
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             state = env.reset(start_of(env, [episode], seed))
             label = EpisodeLabel.of(state, base.road, agent, traffic)
+            # The state after the reset, to which no decision has led.
             recorder.add(state[keys.VEHICLES], 0.0)
             while not state["done"][0] and recorder.time_s < end_s:
                 state = _decide(env, policy, state, recorder)
@@ -270,7 +273,7 @@ def record_episode(
 def _decide(
     env: EnvBase, policy: TensorDictModuleBase, state: TensorDictBase, recorder: Recorder
 ) -> TensorDictBase:
-    """One decision; the state after it."""
+    """One decision of ``policy`` in ``state``, noted by the recorder; the state after it."""
     # What the recorder notes in the frames of this decision.
     state = policy(state)
     action = state[keys.ACTION][0]

@@ -16,7 +16,10 @@ DOCTOR = "check the installation"
 
 
 def commands() -> dict[str, str]:
-    """Every command with what it does, the first line of its YAML file."""
+    """Every command with what it does, from the first line of its YAML file.
+
+    That line is ``# ganlane COMMAND: what it does.``; other files in the folder have none.
+    """
     texts = {}
     for path in sorted(conf_folder().glob("*.yaml")):
         first = path.read_text(encoding="utf-8").partition("\n")[0]
@@ -37,7 +40,8 @@ def usage() -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script; the exit status."""
     open_closed_streams()
-    command, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    command, *rest = words or ["--help"]
     status = 0
     try:
         if command in ("-h", "--help", "help"):
@@ -54,6 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             line = f"ganlane: {command}: no such command; choose one of {names}."
             print(printable(line), file=sys.stderr)
             return USER_ERROR
+        # Here, so that a reader who has left is noticed while it can still be reported.
         sys.stdout.flush()
     except OSError as error:
         return status_of(error, "ganlane")

@@ -211,12 +211,14 @@ def benchmark(
 
 def _drivers(policies: Any, load: Callable[[str], list[Driver]]) -> list[Driver]:
     """One policy, a list or a mapping of them as drivers; ``load`` gives those of a name."""
-    if not isinstance(policies, Mapping | list | tuple):
-        policies = [policies]
+    # A name of the caller's, or None, with each policy.
     if isinstance(policies, Mapping):
         named = list(policies.items())
-    else:
+    elif isinstance(policies, list | tuple):
         named = [(None, policy) for policy in policies]
+    else:
+        named = [(None, policies)]
+
     drivers: list[Driver] = []
     for name, policy in named:
         if isinstance(policy, str | Path):
@@ -230,6 +232,7 @@ def _drivers(policies: Any, load: Callable[[str], list[Driver]]) -> list[Driver]
             several = [Driver(usual, FunctionPolicy(policy))]
         else:
             raise UserError(f"{policy!r:.80}: expected an agent's name, a policy or a function.")
+
         # Several trainings stay one entry under a name of the caller's.
         for number, driver in enumerate(several):
             place = "" if len(several) == 1 else f"@{number}"
@@ -275,6 +278,7 @@ def train(
     keys |= {name: value for name, value in named.items() if value is not None}
     if resume:
         keys["resume"] = str(folder)
+
     try:
         finished = run("train", folder, **keys)
     except Stopped as stop:
@@ -282,6 +286,7 @@ def train(
         raise KeyboardInterrupt(
             "the run was saved; go on with its folder and resume=True"
         ) from stop
+
     table = pl.DataFrame(finished.results["rows"], infer_schema_length=None)
     return TrainingRun(finished.folder, finished.results, Path(finished.results["agent"]), table)
 
@@ -311,8 +316,14 @@ def render(
         UserError: a wrong value.
         OSError: a file that cannot be written.
     """
-    shown = {"agents": agent, "episodes": episode, "run": run}
-    config = call_settings("render", {"traffic": traffic, "out": out, **shown, **keys})
+    words = {
+        "traffic": traffic,
+        "out": out,
+        "agents": agent,
+        "episodes": episode,
+        "run": run,
+    }
+    config = call_settings("render", words | keys)
     # With no file to write named, the run gets a folder with its settings, as the command does.
     folder = new_folder("render") if out is None else Path(out).parent
     with running(folder, config) if out is None else torch_threads(config.threads):
@@ -342,6 +353,7 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
         raise UserError(
             f"run({command!r}): no such command{hint}; choose one of {', '.join(names)}."
         )
+
     # Going on with a run means its own folder.
     home = _home(command, folder)
     # Another run's checkpoint in a new folder would mix the results of two runs.

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose
+from torchrl.envs import Compose, Transform
 
 from ganlane import keys
 from ganlane.agents import load_agent
@@ -60,9 +60,9 @@ def make_highways(config: HighwayConfig) -> TransformedHighway:
 def _constructor_arguments(env: EnvConfig, stream: int) -> dict[str, Any]:
     """What the constructors of traffic models and drivers are given where they have an argument of
     that name.
+
+    :func:`call_with` leaves out what they have no argument for.
     """
-    # Everything a constructor may ask for by the name of its argument; what it does not name
-    # is left out by call_with().
     return {
         "road": env.road(),
         "stream": stream,
@@ -78,6 +78,11 @@ def make_traffic(
 ) -> TrafficModule:
     """The traffic model that ``traffic`` names, on the road of ``env``.
 
+    Args:
+        traffic: its class and parameters.
+        env: the environment, which has the road, and the models that drive by default.
+        stream: stream of its random numbers.
+
     Raises:
         UserError: the target cannot be imported or called, or gives no
             :class:`ganlane.traffic.TrafficModule`.
@@ -85,8 +90,9 @@ def make_traffic(
     # Importing runs code: the path is this package's or was named by the user.
     key = "traffic._target_"
     target = import_target(traffic._target_, key, TrafficModule)
+    arguments = traffic.arguments()
     # A mixed traffic has parts, each with a traffic model of its own, built the same way.
-    arguments, parts = traffic.arguments(), traffic.parts()
+    parts = traffic.parts()
     if parts:
         arguments["parts"] = {name: make_traffic(part, env, stream) for name, part in parts.items()}
     module = call_with(target, _constructor_arguments(env, stream), arguments, key)
@@ -96,7 +102,9 @@ def make_traffic(
             "TrafficModule."
         )
     # Drivers that overlook the ego are a wrapper, so that they work with every traffic model.
-    return BlindTraffic(module, traffic.blind_share) if traffic.blind_share else module
+    if traffic.blind_share:
+        return BlindTraffic(module, traffic.blind_share)
+    return module
 
 
 def make_env(
@@ -108,7 +116,7 @@ def make_env(
     Raises:
         UserError: see :class:`ganlane.env.HighwayEnv`.
     """
-    env, observation, mask = config.env, config.observation, config.mask
+    env = config.env
     base = HighwayEnv(
         traffic,
         num_envs,
@@ -127,26 +135,43 @@ def make_env(
         actions=env.actions,
         mobil=env.mobil,
     )
+
+    # In the order in which a state passes through them.
+    transforms: list[Transform] = []
+    observation = config.observation
     # False where the native kernel does not implement what is asked for.
     native = base.kernel is not None
-    transforms: list[ObservationTransform | ActionMaskTransform] = [
+    transforms.append(
         ObservationTransform(
-            base.road, env.vehicles, observation.form, observation.scale(), native, env.actions
+            base.road,
+            env.vehicles,
+            observation.form,
+            observation.scale(),
+            native,
+            env.actions,
         )
-    ]
-    # The mask needs to know whether a lane change under way may be called off.
+    )
+    mask = config.mask
     if mask.form != "none":
-        abort, vehicles = env.ego.abort_lane_change, env.vehicles if native else None
-        parameters = (mask.form, mask.safe_deceleration, env.idm, abort, vehicles, env.actions)
-        transforms.append(ActionMaskTransform(base.road, *parameters))
-    sensors = observation.sensors
-    errors = []
-    # What the ego's sensors get wrong comes before the observation that is made of it.
-    if sensors is not None:
+        transforms.append(
+            ActionMaskTransform(
+                base.road,
+                mask.form,
+                mask.safe_deceleration,
+                env.idm,
+                # It needs to know whether a lane change under way may be called off.
+                env.ego.abort_lane_change,
+                env.vehicles if native else None,
+                env.actions,
+            )
+        )
+    if observation.sensors is not None:
         with below("observation.sensors"):
-            errors = [SensorTransform(sensors, traffic.stream, env.decision_period_s)]
-    reward = RewardTransform(env.decision_period_s, config.reward)
-    return TransformedHighway(base, Compose(*errors, *transforms, reward))
+            sensors = SensorTransform(observation.sensors, traffic.stream, env.decision_period_s)
+        # What the ego's sensors get wrong comes before the observation that is made of it.
+        transforms.insert(0, sensors)
+    transforms.append(RewardTransform(env.decision_period_s, config.reward))
+    return TransformedHighway(base, Compose(*transforms))
 
 
 @dataclass(frozen=True)
@@ -178,13 +203,16 @@ class Driver:
         ``config``.
         """
         mask = self.mask or config.mask
+        actions = self.actions or config.env.actions
         driven = replace(
             config,
-            env=replace(config.env, actions=self.actions or config.env.actions),
+            env=replace(config.env, actions=actions),
             observation=config.observation.read_by(self.observation),
             mask=mask,
         )
-        return driven, self.policy if mask.form == "none" else MaskedPolicy(self.policy)
+        if mask.form == "none":
+            return driven, self.policy
+        return driven, MaskedPolicy(self.policy)
 
 
 def make_driver(
@@ -217,9 +245,13 @@ def make_driver(
         if mask is None or mask.form != form:
             mask = MaskParameters(form)
         return replace(driver, name=name, mask=mask)
+
+    # a rule-based one, which commands lanes
     if name in DRIVERS:
         policy = call_with(DRIVERS[name], _constructor_arguments(env, stream), {}, "agents")
         return Driver(name, policy.to(device), actions=ActionParameters())
+
+    # a trained agent, shipped or a file
     if names_agent(name):
         # Only the metadata tell which observation the agent needs.
         network, metadata = load_agent(name, device=device)
@@ -227,26 +259,29 @@ def make_driver(
         size = observation_size(reading.observation.form, env.vehicles, reading.actions)
         check_observation_size(name, network.network.config, size)
         return Driver(name, network, reading.observation, reading.mask, reading.actions)
+
     # a model of stable-baselines3, by its weights
     stored = CHECKPOINTS / f"{name}.zip" if name in SHIPPED_MODELS else Path(name)
     if stored.suffix == ".zip":
         model, reading = load_model(stored, device)
         return Driver(name, model, reading.observation, reading.mask, reading.actions)
+
     # a plain function of observations
     if is_function_path(name):
         return Driver(name, FunctionPolicy(imported(name, "agents")))
+
     # a user's own policy; it reads the raw state or the observation of the command
     if is_import_path(name):
         target = import_target(name, "agents", TensorDictModuleBase)
         policy = call_with(target, _constructor_arguments(env, stream), {}, "agents")
-        if not isinstance(policy, TensorDictModuleBase) or keys.ACTION not in getattr(
-            policy, "out_keys", []
-        ):
+        out_keys = getattr(policy, "out_keys", [])
+        if not isinstance(policy, TensorDictModuleBase) or keys.ACTION not in out_keys:
             raise UserError(
                 f"agents={name}: expected a TensorDictModule that writes 'action'; its out_keys "
                 "name it."
             )
         return Driver(name, policy.to(device))
+
     # A light wheel lacks some of the files, so only those that are there are suggested.
     shipped = [name for name in SHIPPED if (CHECKPOINTS / f"{name}.safetensors").is_file()]
     names = ", ".join([*DRIVERS, *shipped, *SHIPPED_MODELS])
@@ -264,7 +299,9 @@ def make_drivers(
     ``agent_idm@all`` means every shipped training of its recipe.
     """
     # A dictionary drops repeated names and keeps their order.
-    single_names = dict.fromkeys(single for name in names for single in with_seeds(name))
+    single_names: dict[str, None] = {}
+    for name in names:
+        single_names |= dict.fromkeys(with_seeds(name))
     return [make_driver(name, env, stream, device) for name in single_names]
 
 
@@ -287,4 +324,6 @@ def reading_of(metadata: Mapping[str, Any]) -> Reading:
             "the agent's metadata name no observation, mask and actions that are known here "
             f"({error}); train it again or give another."
         ) from error
-    return Reading(observation, None if mask.form == "none" else mask, actions=actions)
+    # With the mask "none" it takes that of the command.
+    own_mask = None if mask.form == "none" else mask
+    return Reading(observation, own_mask, actions=actions)

@@ -92,7 +92,9 @@ class HighwayVecEnv(VecEnv):
         # The constructor of VecEnv asks for render_mode through get_attr(), so highways is set
         # first.
         super().__init__(
-            highways.num_envs, highways.single_observation_space, highways.single_action_space
+            highways.num_envs,
+            highways.single_observation_space,
+            highways.single_action_space,
         )
 
     def reset(self) -> Floats:
@@ -272,6 +274,7 @@ class ModelPolicy(ObservationPolicy):
             )
         if self.normaliser is not None:
             observation = self.normaliser.normalize_obs(observation)
+
         more: dict[str, Any] = {}
         if _is_masked(self.model):
             more["action_masks"] = mask_in(tensordict).cpu().numpy()
@@ -282,11 +285,13 @@ class ModelPolicy(ObservationPolicy):
             # [layers, N, size]; another environment may have another N.
             if self._memory is not None and self._memory[0].shape[1] == len(observation):
                 more["state"] = self._memory
+
         chosen, self._memory = self.model.predict(observation, deterministic=True, **more)
         # Whole numbers of several types; floats are controls as they are.
         action = torch.as_tensor(chosen, device=tensordict.device)
-        numbered = isinstance(self.model.action_space, gymnasium.spaces.Discrete)
-        return action.long() if numbered else action
+        if isinstance(self.model.action_space, gymnasium.spaces.Discrete):
+            return action.long()
+        return action
 
 
 class ModelDriver(Driver):
@@ -308,11 +313,16 @@ class ModelDriver(Driver):
         file = _model_file(path)
         with atomic_path(file) as part:
             self.policy.model.save(part)
+
+        # Of stable-baselines3's only the numbers that it normalises with are stored.
         normaliser = self.policy.normaliser
         if isinstance(normaliser, VecNormalize):
             statistics: Any = normaliser.obs_rms
             normaliser = Normaliser(
-                statistics.mean, statistics.var, normaliser.epsilon, normaliser.clip_obs
+                statistics.mean,
+                statistics.var,
+                normaliser.epsilon,
+                normaliser.clip_obs,
             )
         network = _network(self.policy.model)
         reading = Reading(self.observation, self.mask, normaliser, network, self.actions)
@@ -362,6 +372,8 @@ def _of_environment(model: BaseAlgorithm) -> tuple[Reading, VecNormalize | None]
             f"{kind}.load(path, env=make_vec_env(...)), or give stored=path if driver(...).save() "
             "wrote it."
         )
+
+    # From the outermost wrapper to the highway itself.
     normaliser = None
     for layer in _layers(env):
         if isinstance(layer, OnRows):
@@ -377,6 +389,7 @@ def _of_environment(model: BaseAlgorithm) -> tuple[Reading, VecNormalize | None]
             normaliser = layer
         elif not isinstance(layer, _TRANSPARENT):
             raise _not_repeatable(layer)
+
     # Other algorithms drive without a mask, whatever mask their environment shows.
     mask = settings.mask if _is_masked(model) else None
     if mask is not None and mask.form == "none":
@@ -421,6 +434,7 @@ def _layers(env: Any) -> Iterator[Any]:
 
 
 def _not_repeatable(layer: Any) -> UserError:
+    """The error on a wrapper or transform that changes what the model reads or commands."""
     return UserError(
         f"driver(): {type(layer).__name__} stands between the model and the highway, and a driver "
         "cannot repeat what it does; train without it, or evaluate in your own loop."

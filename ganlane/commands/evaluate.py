@@ -21,8 +21,13 @@ def evaluate(config: EvaluateConfig, folder: Path) -> str:
 
     The line that names the results.
     """
-    table = compare(make_drivers(config.agents, config.env, config.device), config)
-    seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
+    drivers = make_drivers(config.agents, config.env, config.device)
+    table = compare(drivers, config)
+    seeds = {
+        "stream": config.stream,
+        "seed": config.seed,
+        "episodes": [0, config.episodes - 1],
+    }
     return publish(table, folder, config, seeds)
 
 
@@ -40,8 +45,14 @@ def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
     recorded = table.filter(pl.col("scene").is_not_null())
     for (agent, traffic), episodes in recorded.group_by("agent", "traffic", maintain_order=True):
         per_km, scenes = evaluation.crashes_by_scene(episodes, episodes["scene"].to_list())
-        row = {"agent": agent, "traffic": traffic, **entries("per_km", per_km), "scenes": scenes}
-        rows.append(row)
+        rows.append(
+            {
+                "agent": agent,
+                "traffic": traffic,
+                **entries("per_km", per_km),
+                "scenes": scenes,
+            }
+        )
     return rows
 
 
@@ -57,7 +68,17 @@ def publish(
     ``results.json`` holds ``rows``, ``paired`` (:func:`ganlane.evaluation.paired_rows`; a second
     table with two drivers or more), ``failures`` (:func:`ganlane.evaluation.failed_episodes`),
     ``crashes_by_scene`` where a traffic replays recorded scenes (:func:`recorded_crashes`), and
-    further ``numbers``. Returns the line that names it.
+    further ``numbers``.
+
+    Args:
+        table: the episodes.
+        folder: of the run, in which the files are written.
+        config: of the command; its ``columns`` are those of the tables.
+        seeds: which episodes they were, for ``results.json``.
+        numbers: further ones.
+
+    Returns:
+        The line that names ``results.json``.
     """
     # On the same episodes a difference shows long before two intervals part.
     rows = evaluation.evaluation_rows(table)
@@ -67,6 +88,7 @@ def publish(
     if paired:
         tables.append(evaluation.paired_table(paired))
     show(*tables, columns=config.columns)
+
     record: dict[str, Any] = {"rows": rows, "paired": paired}
     recorded = recorded_crashes(table)
     if recorded:

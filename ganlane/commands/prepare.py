@@ -48,7 +48,8 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
 
 def short_report(prepared: PooledStatistics) -> str:
     """Rows, exposure, lane-change rates and durations in a few lines."""
-    exposure, count = prepared.exposure, prepared.count
+    exposure = prepared.exposure
+    count = prepared.count
     # What was read and dropped first: a wrong format shows there.
     lines = [f"rows: {count.read:,} read, {count.kept:,} kept, {prepared.written:,} written"]
     lines += [f"dropped: {rows:,} ({reason})" for reason, rows in count.dropped.most_common()]
@@ -61,6 +62,7 @@ def short_report(prepared: PooledStatistics) -> str:
 
 
 def _lane_change_lines(prepared: PooledStatistics) -> list[str]:
+    """Their rates, and their duration where it is known."""
     changes = prepared.lane_changes
     duration = changes.duration
     complete = duration.complete
@@ -84,6 +86,7 @@ def _lane_change_lines(prepared: PooledStatistics) -> list[str]:
 
 
 def _acceleration_lines(prepared: PooledStatistics) -> list[str]:
+    """Share of strong accelerations; no line without any acceleration."""
     parts = []
     # Raw ones are mostly noise of the measurement; both are shown, so that this shows.
     for name, title in (("raw", "as recorded"), ("smoothed", "over 1 s")):

@@ -60,13 +60,17 @@ def realism(config: RealismConfig, folder: Path) -> str:
     factories = factories_on_card(config)
     files = files_wanted(config, path)
     starts = drive_from_starts(config, factories, path)
+
     # Empty without files of one lane; the card then leaves these rows out.
-    site = {name: one_lane_rows(config, factories, starts, name, files[name]) for name in files}
+    site = {}
+    for name, file in files.items():
+        site[name] = one_lane_rows(config, factories, starts, name, file)
     # Long runs of the rivals take as long again, so they are made on request.
     runs = {}
     for name, make in factories.items():
         if name == config.traffic.label() or config.long_against:
             runs[name] = long_runs(config, name, make)
+
     # Measured and compared here; drawing and printing only show it.
     numbers = card_numbers(starts, site, runs, config.resamples)
     draw(numbers, starts, folder)
@@ -87,7 +91,11 @@ def factories_on_card(config: RealismConfig) -> dict[str, Factory]:
 
 
 def scenes_path(config: RealismConfig) -> Path | None:
-    """The recordings; None where none are named and none are found."""
+    """The recordings; None where none are named and none are found.
+
+    Raises:
+        UserError: the folder of data that was named is not there.
+    """
     if config.data.path:
         return Path(config.data.path)
     data_folder()  # a folder that was named must be there
@@ -101,7 +109,11 @@ def _make(traffic: TrafficConfig, env: EnvConfig, road: Road) -> TrafficModule:
     """The traffic on a road."""
     # A copy that is not checked again: a recorded road need not fit Table II's vehicles.
     env = copy(env)
-    assign(env, lanes=int(road.lanes), lane_width_m=float(road.lane_width_m))
+    assign(
+        env,
+        lanes=int(road.lanes),
+        lane_width_m=float(road.lane_width_m),
+    )
     # The stream of reported figures, never the one that recipes are chosen on.
     return make_traffic(traffic, env, Stream.REPORT)
 
@@ -109,7 +121,15 @@ def _make(traffic: TrafficConfig, env: EnvConfig, road: Road) -> TrafficModule:
 def starts_and_held_out(
     config: RealismConfig, scenes: Sequence[str]
 ) -> tuple[Sequence[str], Sequence[str]]:
-    """The scenes that traffics start from, and those that nothing was fitted to."""
+    """The scenes that traffics start from, and those that nothing was fitted to.
+
+    Args:
+        config: of the card.
+        scenes: names of all scenes of the recordings.
+
+    Raises:
+        UserError: no scene is held out to start from.
+    """
     # Nothing is held out of recordings that nothing is fitted to.
     held_out: Sequence[str] = ()
     if config.scenes != "all" or _fits(config, scenes):
@@ -132,13 +152,16 @@ def _fits(config: RealismConfig, scenes: Sequence[str]) -> bool:
     # Desired speeds that are fitted need scenes of their own, too.
     if config.data.held_out is not None or config.desired_above_mps is None:
         return True
+
     used = traffics_on_card(config)
     for name in PRESETS.keys() & used.keys():
         # The file of weights tells what it was fitted to.
         path = getattr(used[name], "path", None) or shipped_generator(PRESETS[name])
-        data = load_weights(path, "generator")[1].get("data", {})
+        _, metadata = load_weights(path, "generator")
+        data = metadata.get("data", {})
         # Scenes that chose the weights (early stopping) count as seen, like those of the fit.
-        if set(scenes) & {*data.get("fitted", ()), *data.get("validation", ())}:
+        seen = {*data.get("fitted", ()), *data.get("validation", ())}
+        if seen.intersection(scenes):
             return True
     return False
 
@@ -148,29 +171,46 @@ def drive_from_starts(
     factories: Mapping[str, Factory],
     path: Path | None,
 ) -> Starts:
-    """Drive every traffic from recorded scenes, or from spawned ones where there are none."""
+    """Drive every traffic from recorded scenes, or from spawned ones where there are none.
+
+    Args:
+        config: of the card.
+        factories: what makes the traffics, by name.
+        path: the recordings; None where there are none.
+
+    Raises:
+        UserError: recordings that cannot be read, or no scene to start from.
+    """
     if path is None:
         spawn = config.env.spawn_parameters()
         return spawned_starts(factories, config.env.road(), spawn, config.repeats, config.seed)
+
     # Recorded starts: every vehicle begins where and as fast as it was recorded.
     frame = read_scenes(path)
-    chosen = starts_and_held_out(config, sorted(frame["scene"].unique().to_list()))
+    scenes = sorted(frame["scene"].unique().to_list())
+    chosen, held_out = starts_and_held_out(config, scenes)
     # Desired speeds are fitted unless the user gives them.
+    is_fitted = config.desired_above_mps is None
     options = StartOptions(repeats=config.repeats, seed=config.seed)
     if config.desired_above_mps is not None:
         options = replace(options, desired_above_mps=config.desired_above_mps)
     return recorded_starts(
         factories,
-        *chosen,
+        chosen,
+        held_out,
         frame,
         options,
-        config.desired_above_mps is None,
+        is_fitted,
         str(path),
     )
 
 
 def files_wanted(config: RealismConfig, path: Path | None) -> dict[str, Path]:
-    """The files of one lane next to the scenes that ``config`` asks for, by name."""
+    """The files of one lane next to the scenes that ``config`` asks for, by name.
+
+    Raises:
+        UserError: they are asked for, and none is there.
+    """
     files = {}
     if path is not None and config.i80 is not False:
         files = one_lane_files(path)
@@ -190,22 +230,35 @@ def one_lane_rows(
     name: str,
     path: Path,
 ) -> dict[str, Any]:
-    """The card's rows on a file of one lane; nothing is fitted to the site."""
+    """The card's rows on a file of one lane; nothing is fitted to the site.
+
+    Args:
+        config: of the card.
+        factories: what makes the traffics, by name.
+        starts: what was driven from the scenes; its desired speeds are those of the site, too.
+        name: of the site, one of :data:`ganlane.data.one_lane.ONE_LANE_FILES`.
+        path: its file.
+    """
     # Once each: the site has many more segments than scenes.
     recordings = read_one_lane(name, path)
     options = StartOptions(seed=config.seed)
     driven = simulate_all(factories, recordings, options, starts.desired_above_mps)
+
     recorded = measure(recordings)
+    # Lane changes and the like are not to be seen in one lane.
     counts = {quantity: recorded.counts[quantity] for quantity in ONE_LANE_QUANTITIES}
-    site = replace(starts, driven=driven, recorded=replace(recorded, counts=counts))
+    in_one_lane = replace(recorded, counts=counts)
+    site = replace(starts, driven=driven, recorded=in_one_lane)
     return card_rows(site, config.resamples)
 
 
 def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str, Any]]:
-    """One long run of a traffic per number of vehicles."""
-    runs = []
+    """One long run of a traffic per number of vehicles; none with ``vehicle_km=0``."""
+    runs: list[dict[str, Any]] = []
+    if config.vehicle_km == 0:
+        return runs
     # Each number of vehicles is a density of its own, at the paper's spacing.
-    for vehicles in config.long_vehicles if config.vehicle_km > 0 else ():
+    for vehicles in config.long_vehicles:
         parameters = LongRunParameters(
             vehicles,
             config.vehicle_km,

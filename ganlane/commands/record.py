@@ -41,62 +41,101 @@ except ImportError as error:
 #: Episodes that are written at a time: each time costs milliseconds.
 _AT_ONCE = 64
 #: Arguments of the environment that decide what its episodes are like.
-_ARGUMENTS = ("traffic", "env", "observation", "reward", "mask", "stream")
+_ARGUMENTS = (
+    "traffic",
+    "env",
+    "observation",
+    "reward",
+    "mask",
+    "stream",
+)
 
 
 def record(config: RecordConfig, folder: Path) -> str:
-    """Drive the episodes and write them; the line that names the dataset."""
+    """Drive the episodes and write them; the line that names the dataset.
+
+    Raises:
+        UserError: a dataset of this name is there already.
+    """
     # The stream decides which episodes are driven; a random driver draws from it, too.
-    driver = make_driver(config.driver, config.env, Stream.named(config.stream), config.device)
+    stream = Stream.named(config.stream)
+    driver = make_driver(config.driver, config.env, stream, config.device)
     # A trained agent reads the observation that it was trained with, whatever the command says.
     driven, policy = driver.driving(config)
     # More rows than episodes would drive some that nobody asked for.
     driven = replace(driven, num_envs=min(config.num_envs, config.episodes))
     rows = TensorRows(driven)
+
     # What minari's recover_environment() makes.
     # The specification is shared by the whole process, so a copy is changed.
     spec = deepcopy(gymnasium.spec(ENV_ID))
     spec.kwargs = {name: plain(getattr(driven, name)) for name in _ARGUMENTS}
     spec.max_episode_steps = rows.episode.most_decisions()
-    name, root = config.dataset_name(), Path(config.out or folder).absolute()
+
+    # Minari finds a dataset by its name below a root folder.
+    name = config.dataset_name()
+    root = Path(config.out or folder).absolute()
     place = root / name
     if place.exists():
         raise UserError(
             f"{place}: a dataset is there already; give another dataset=NAME or out=FOLDER."
         )
+
     # A dataset that is half written is not found by Minari.
     with cleared_after_mistakes(place.parent), whole_folder(place) as part:
         storage = MinariStorage.new(part / "data", rows.space, rows.action_space(), spec)
+        description = f"{driver.name} among {config.traffic.label()}, seed {config.seed}"
         storage.update_metadata(
             {
                 "dataset_id": name,
                 "algorithm_name": driver.name,
                 "minari_version": minari.__version__,
-                "description": (
-                    f"{driver.name} among {config.traffic.label()}, seed {config.seed}"
-                ),
+                "description": description,
             }
         )
-        facts = _write(storage, _episodes(rows, policy, config), config.episodes)
-    seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
-    write_results(folder, {"dataset": name, "root": str(root), **facts}, config, seeds)
+        episodes = _episodes(rows, policy, config)
+        facts = _write(storage, episodes, config.episodes)
+
+    numbers = {
+        "dataset": name,
+        "root": str(root),
+        **facts,
+    }
+    seeds = {
+        "stream": config.stream,
+        "seed": config.seed,
+        "episodes": [0, config.episodes - 1],
+    }
+    write_results(folder, numbers, config, seeds)
     print(", ".join(f"{key.replace('_', ' ')} {value}" for key, value in facts.items()))
     return f"dataset: minari.load_dataset({name!r}) with MINARI_DATASETS_PATH={root}"
 
 
 def _episodes(rows: TensorRows, policy: Any, config: RecordConfig) -> Iterator[EpisodeBuffer]:
     """The episodes as they end; row i of N drives i, i + N, i + 2N, ..."""
+    # The episode that each row is in.
     buffers: dict[int, Any] = {}
 
     def begin(chosen: Iterable[int]) -> None:
+        """Begin the episodes that the rows ``chosen`` have been reset to."""
+        numbers = rows.array(EPISODE)
         for row in chosen:
-            number = int(rows.array(EPISODE)[row])
-            buffers[row] = EpisodeBuffer(number, config.seed, {"episode": number}, [], [], infos={})
+            number = int(numbers[row])
+            buffers[row] = EpisodeBuffer(
+                id=number,
+                seed=config.seed,
+                options={"episode": number},
+                observations=[],
+                actions=[],
+                infos={},
+            )
         observe(chosen)
 
     def observe(chosen: Iterable[int]) -> None:
         """Add what the rows ``chosen`` are in to their episodes."""
-        observation, info = rows.observation().copy(), rows.info()
+        # A copy, since the rows write their next observations into the same array.
+        observation = rows.observation().copy()
+        info = rows.info()
         for row in chosen:
             buffers[row].observations.append(observation[row])
             _append(buffers[row].infos, row_of(info, row))
@@ -107,8 +146,10 @@ def _episodes(rows: TensorRows, policy: Any, config: RecordConfig) -> Iterator[E
     while any(buffer.id < config.episodes for buffer in buffers.values()):
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             # The policy may write into what it is given; the rows keep their own.
-            actions = policy(rows.now().clone(recurse=False)).get(ACTION).cpu().numpy()
+            decided = policy(rows.now().clone(recurse=False))
+            actions = decided.get(ACTION).cpu().numpy()
         stepped = rows.step(actions)
+
         # The state after the last decision belongs to the episode, so observations are one more.
         observe(buffers)
         for row, buffer in buffers.items():
@@ -116,10 +157,13 @@ def _episodes(rows: TensorRows, policy: Any, config: RecordConfig) -> Iterator[E
             buffer.rewards.append(stepped.reward[row])
             buffer.terminations.append(stepped.terminated[row])
             buffer.truncations.append(stepped.truncated[row])
+
         has_ended = stepped.terminated | stepped.truncated
         ended = np.flatnonzero(has_ended).tolist()
-        # A row goes on with further episodes until all rows have driven theirs.
-        yield from (buffers[row] for row in ended if buffers[row].id < config.episodes)
+        for row in ended:
+            # A row goes on with further episodes until all rows have driven theirs.
+            if buffers[row].id < config.episodes:
+                yield buffers[row]
         if ended:
             rows.restart(has_ended)
             begin(ended)
@@ -135,22 +179,36 @@ def _append(lists: dict[str, Any], values: dict[str, Any]) -> None:
 
 
 def _write(storage: Any, episodes: Iterator[EpisodeBuffer], count: int) -> dict[str, Any]:
-    """Write the episodes in the order of their numbers, as Minari wants; what they were like."""
+    """Write the ``count`` episodes in the order of their numbers, as Minari wants.
+
+    Returns:
+        What they were like: number of ``episodes`` and ``decisions``, ``mean_return``, and
+        ``ends``, how many episodes ended by which event.
+    """
+    # Episodes that have ended before one with a lower number.
     waiting: dict[int | None, EpisodeBuffer] = {}
-    written, decisions, total, ends = 0, 0, 0.0, Counter[str]()
+    written = 0
+    decisions = 0
+    total_return = 0.0
+    ends = Counter[str]()
+
     # Without a terminal there is no bar.
     for episode in tqdm(episodes, total=count, unit="episode", disable=None):
         decisions += len(episode)
-        total += float(sum(episode.rewards))
+        total_return += float(sum(episode.rewards))
+        # Whether an event has happened stands in the last state.
         ends.update(event for event in END_EVENTS if episode.infos[event][-1])
+
         waiting[episode.id] = episode
+        # Numbers from the next one on, as far as there is no gap.
         ready = list(itertools.takewhile(waiting.__contains__, itertools.count(written)))
         if len(ready) >= _AT_ONCE or written + len(ready) == count:
             storage.update_episodes([waiting.pop(number) for number in ready])
             written += len(ready)
+
     return {
         "episodes": written,
         "decisions": decisions,
-        "mean_return": round(total / count, 2),
+        "mean_return": round(total_return / count, 2),
         "ends": dict(ends),
     }

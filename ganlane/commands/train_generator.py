@@ -27,14 +27,19 @@ Lines = list[list[str]]
 
 
 def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
-    """Read the recordings, fit, print the errors on held-out scenes, save weights and results."""
+    """Read the recordings, fit, print the errors on held-out scenes, save weights and results.
+
+    Raises:
+        UserError: recordings that cannot be read, or scenes that do not fit together.
+    """
     source = recordings_path(config.data)
     with byte_progress("read") as read:
         frame = read_recordings(config.data.format, source, config.data.parameters(), read)
+    scenes = recordings_of(frame)
+    names = [scene.name for scene in scenes]
+    held_out = config.data.held_out_scenes(names, generator.HELD_OUT)
     # The seed of the command is that of the fit.
     fit_config: Any = replace(config.generator, seed=config.seed)
-    scenes = recordings_of(frame)
-    held_out = config.data.held_out_scenes([scene.name for scene in scenes], generator.HELD_OUT)
     # Scenes that do not fit together are refused now rather than after hours of fitting.
     generator.split_for_fit(scenes, held_out)
     if config.folds:
@@ -49,11 +54,17 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     states = Path(config.resume or folder) / "fits"
     weights = folder / f"generator_{fit_config.preset}.safetensors"
     further: dict[str, Any] = {}
+
     # What takes long is shown as soon as it is there; the last fit is the one that is saved.
     with FitProgress() as progress:
         if config.folds:
             further["folds"] = generator.cross_validate(
-                fit_config, frame, config.folds, states, progress, following
+                fit_config,
+                frame,
+                config.folds,
+                states,
+                progress,
+                following,
             )
             show(fold_tables(further["folds"]), columns=config.columns)
         # The generator that is saved is fitted to everything but the held-out scenes.
@@ -67,11 +78,13 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
             following,
         )
 
+    # Errors of each held-out scene, and of all of them together.
     scenes_apart = dict(result.metrics)
     overall = scenes_apart.pop("all")
     show(aligned(errors_table(overall, "held out")), columns=config.columns)
     result.save(weights, further.get("folds"), code_version())
     print(f"weights: {weights}")
+
     # What the command line shows is also in results.json, in full.
     numbers = {
         "preset": result.config.preset,
@@ -90,7 +103,10 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
 
 
 class FitProgress(AbstractContextManager["FitProgress"]):
-    """Shows fits, a bar for one after the other. A context that closes the last bar."""
+    """Shows fits, a bar for one after the other. A context that closes the last bar.
+
+    A fit calls it with the updates so far, and the score of the last validation.
+    """
 
     def __init__(self) -> None:
         self._bar: tqdm | None = None
@@ -99,6 +115,7 @@ class FitProgress(AbstractContextManager["FitProgress"]):
 
     def __call__(self, progress: Progress) -> None:
         """Called by the fit after every update."""
+        # Another name: the next fit has begun.
         if self._bar is None or self._bar.desc != progress.name:
             self.__exit__()
             self._bar = tqdm(
@@ -111,6 +128,7 @@ class FitProgress(AbstractContextManager["FitProgress"]):
         if progress.score is not None:
             scores = f"validation score {progress.score:.4f}, best {progress.best:.4f}"
             self._bar.set_postfix_str(scores, refresh=False)
+        # By the difference, since a resumed fit does not begin with the first update.
         self._bar.update(progress.update - self._bar.n)
 
     def __exit__(self, *error: object) -> None:
@@ -125,7 +143,10 @@ def _percent(change: float) -> str:
 def fold_tables(folds: Mapping[str, Any]) -> str:
     """What :func:`ganlane.generator.cross_validate` scored, but for single scenes, as text."""
     scores = folds["open_loop"]
-    tables = [errors_table(scores, "of all folds"), _parts("by fold", scores["folds"])]
+    tables = [
+        errors_table(scores, "of all folds"),
+        _parts("by fold", scores["folds"]),
+    ]
     if "rollout" in folds:
         tables.append(_rollout(folds["rollout"]))
     return "\n\n".join(map(aligned, tables))
@@ -133,17 +154,17 @@ def fold_tables(folds: Mapping[str, Any]) -> str:
 
 def errors_table(scores: Mapping[str, Any], which: str) -> Lines:
     """ADE and FDE of all forecasts over the windows ``which``; the ADE to constant velocity's."""
-    lines = [
-        [
-            f"{scores['windows']} windows {which}",
-            "ADE, m",
-            "FDE, m",
-            "ADE to CV",
-        ]
+    heading = [
+        f"{scores['windows']} windows {which}",
+        "ADE, m",
+        "FDE, m",
+        "ADE to CV",
     ]
-    for kind, ade in scores["ade_m"].items():
-        errors = [f"{ade:.3f}", f"{scores['fde_m'][kind]:.3f}"]
-        lines.append([kind, *errors, _percent(scores["ade_change_percent"][kind])])
+    lines = [heading]
+    for kind, ade_m in scores["ade_m"].items():
+        fde_m = scores["fde_m"][kind]
+        change = scores["ade_change_percent"][kind]
+        lines.append([kind, f"{ade_m:.3f}", f"{fde_m:.3f}", _percent(change)])
     return lines
 
 
@@ -151,7 +172,9 @@ def _parts(title: str, parts: Mapping[str, Any]) -> Lines:
     """Windows, constant velocity's ADE and the generator's change relative to it, for each part."""
     # The mean of the samples, one sample, and the best of several: different questions.
     generated = ("mean", "single", f"best_of_{SAMPLES}")
-    kinds = [kind for kind in generated if kind in next(iter(parts.values()))["ade_m"]]
+    # All parts have the same forecasts.
+    first = next(iter(parts.values()))
+    kinds = [kind for kind in generated if kind in first["ade_m"]]
     lines = [[title, "windows", "CV, m", *kinds]]
     for name, part in parts.items():
         changes = [_percent(part["ade_change_percent"][kind]) for kind in kinds]
@@ -167,15 +190,14 @@ def _parts(title: str, parts: Mapping[str, Any]) -> Lines:
 
 
 def _rollout(rollout: Mapping[str, Any]) -> Lines:
-    """RMSE after 1 to 5 s."""
+    """RMSE after 1 to 5 s, and relative to constant velocity's."""
     rmse = rollout["rmse_m"]
-    lines = [
-        [
-            f"RMSE, m ({rollout['windows']} windows)",
-            *rmse[BASELINE],
-            "to CV",
-        ]
+    heading = [
+        f"RMSE, m ({rollout['windows']} windows)",
+        *rmse[BASELINE],
+        "to CV",
     ]
+    lines = [heading]
     for kind, ratio in rollout["ratio_to_constant_velocity"].items():
         numbers = [*rmse[kind].values(), ratio]
         lines.append([kind, *(f"{number:.2f}" for number in numbers)])

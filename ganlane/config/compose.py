@@ -34,7 +34,10 @@ _HELP = "run the command with --help to see all keys"
 HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
 _HYDRA_PLUGIN = re.compile(r"hydra(/|\.)(launcher|sweeper)\b")
 #: Keys that a command calls by another name, because ``agent=`` would choose an option of a group.
-ALIASES = {"render": {"agent": "agents", "episode": "episodes"}, "record": {"agent": "driver"}}
+ALIASES = {
+    "render": {"agent": "agents", "episode": "episodes"},
+    "record": {"agent": "driver"},
+}
 
 
 def parsed(command: str, words: Sequence[str]) -> list[Override]:
@@ -50,14 +53,17 @@ def parsed(command: str, words: Sequence[str]) -> list[Override]:
             raise UserError(
                 f"{word!a}: has characters that this locale does not know; set LC_ALL=C.UTF-8."
             )
+
     # Words without = are agents. A path may have an = in it, as the folders of a sweep do.
     bare = [word for word in words if "=" not in word or os.path.exists(word)]
     if command == "benchmark" and bare:
         others = [word for word in words if word not in bare]
         words = [*others, f"agents={json.dumps(bare)}"]
+
     # Hydra's own grammar, so that quotes, lists and sweeps mean what its users expect.
+    meant = [_as_meant(command, word) for word in words]
     try:
-        overrides = OverridesParser.create().parse_overrides([_as_meant(command, w) for w in words])
+        overrides = OverridesParser.create().parse_overrides(meant)
     except (ValueError, RecursionError) as error:  # limits of Python
         raise UserError(
             "a value of the command line: too long a number or too deep a list; shorten it."
@@ -85,6 +91,7 @@ def _as_meant(command: str, word: str) -> str:
 
 
 def _is_group(key: str) -> bool:
+    """Whether the key chooses among options, which are the files in a folder of its name."""
     return (conf_folder() / key).is_dir()
 
 
@@ -103,6 +110,7 @@ def _check(override: Override) -> None:
         if "/" in key and not str(override.value()).isidentifier():
             raise UserError(f"{word}: no such option; give a launcher's name, such as joblib.")
         return
+
     if not _is_group(key):
         return
     values = [override.value()]
@@ -126,8 +134,10 @@ def for_hydra(overrides: Sequence[Override]) -> list[str]:
         if _is_group(key) or key.startswith("hydra"):
             words.append(word)
             continue
+        # Hydra would merge a mapping into that of an experiment.
         if "{" in word and not override.is_sweep_override():
-            words.append(f"++{key}=null")  # Hydra would merge it into the mapping of an experiment
+            words.append(f"++{key}=null")
+        # With ++ a key is set whether or not a file has it.
         words.append(f"++{word}")
     return words
 
@@ -155,11 +165,13 @@ def composed(command: str, overrides: Sequence[Override] = ()) -> dict[str, Any]
 # Cached, since the same files would be composed at every Python call.
 @cache
 def _defaults(command: str, *words: str) -> dict[str, Any]:
+    """Plain data of a command line, shared by all calls: it must not be changed."""
     return composed(command, parsed(command, words))
 
 
 def called(command: str, keys: Mapping[str, Any]) -> dict[str, Any]:
     """Plain data of a Python call: the command's own defaults with ``keys`` on top."""
+    # An experiment is a set of defaults, so it is composed with the others.
     words = [f"experiment={keys['experiment']}"] if "experiment" in keys else []
     others = {name: value for name, value in keys.items() if name != "experiment"}
     return merged(deepcopy(_defaults(command, *words)), others)
@@ -178,7 +190,8 @@ def resumed(saved: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str
     for override in overrides:
         key = key_of(override)
         if not key.startswith("hydra"):
-            OmegaConf.update(config, key, OmegaConf.select(now, key), merge=False, force_add=True)
+            value = OmegaConf.select(now, key)
+            OmegaConf.update(config, key, value, merge=False, force_add=True)
     return OmegaConf.to_container(config)  # type: ignore[return-value]
 
 
@@ -192,13 +205,17 @@ def sentence(error: BaseException) -> str:
             f"{error.override}: not of the form key=value; quote values with spaces or brackets, "
             f"{_HELP}."
         )
+
     # Hydra's errors have many lines; the part that says what is wrong is kept.
     text = " ".join(str(error).split())
     refused = re.search(r"Could not override '([^'@]+)[^']*'", text)
     if refused:
-        plural = f" (did you mean {refused[1]}s=[NAME,NAME]?)"
-        hint = plural if refused[1] in ("agent", "traffic") else ""
-        return f"{refused[1]}: not an option of this command{hint}; {_HELP}."
+        key = refused[1]
+        # Some commands take several of them.
+        plural = f" (did you mean {key}s=[NAME,NAME]?)"
+        hint = plural if key in ("agent", "traffic") else ""
+        return f"{key}: not an option of this command{hint}; {_HELP}."
+
     ambiguous = re.search(r"Ambiguous value for argument '\+*([^']+)'", text)
     if ambiguous:
         return f"{ambiguous[1]}: several values; write [a,b] for a list, or add -m for a sweep."

@@ -78,10 +78,23 @@ LOCK = ".lock"
 #: The checkpoint of a run, below its folder.
 LAST = Path("checkpoints") / "last.pt"
 #: Files that took time to make.
-EARNED = ("results.json", "agent.safetensors", "last.pt", "fits/*.pt", "generator_*.safetensors")
+EARNED = (
+    "results.json",
+    "agent.safetensors",
+    "last.pt",
+    "fits/*.pt",
+    "generator_*.safetensors",
+)
+#: Where runs go that are given no folder.
 OUTPUTS = Path("outputs")
 #: Folders of a run that it writes to itself; others below it may be runs of their own.
-_OWN_FOLDERS = (".", "checkpoints", "pretrain", "pretrain/checkpoints", "fits")
+_OWN_FOLDERS = (
+    ".",
+    "checkpoints",
+    "pretrain",
+    "pretrain/checkpoints",
+    "fits",
+)
 #: Import paths below these are trusted wherever they stand.
 _OWN_PACKAGES = ("ganlane.", "ganlane_simulators.")
 
@@ -105,6 +118,7 @@ def run_command(command: str, arguments: Sequence[str] | None = None) -> int:
     open_closed_streams()
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL would log every replay buffer
     keep_freed_memory()
+
     try:
         with _sigterm_as_exception():
             _do(command, words)
@@ -140,6 +154,7 @@ def _do(command: str, words: list[str]) -> None:
     # Hydra would have a score of flags; these three are all that is needed.
     flags = [word for word in words if word.startswith("-")]
     keys = [word for word in words if word not in flags]
+
     if {"-h", "--help"} & set(flags):
         print(help_text(command, COMMANDS[command]))
     elif flags == ["--cfg"] and "job" in keys:
@@ -169,10 +184,12 @@ def settings(command: str, words: Sequence[str]) -> Any:
 
 def _settings_and_folder(command: str, overrides: list[Override]) -> tuple[Any, Path]:
     """The checked record, and the folder of its run: the resumed one, that given, or a new one."""
+    # The last word of a key counts.
+    values = {str(word.key_or_group): word for word in overrides}
+    rest = overrides
     # A resumed training is its saved settings; the command line changes some of them. For
     # train_generator resume= is a key like any other.
-    values = {str(word.key_or_group): word for word in overrides}
-    resume, rest = None, overrides
+    resume = None
     if command == "train":
         resume = values.pop("resume", None)
         rest = [word for word in overrides if word.key_or_group != "resume"]
@@ -183,9 +200,12 @@ def _settings_and_folder(command: str, overrides: list[Override]) -> tuple[Any, 
             config: Any = make(TrainConfig, {**data, "resume": str(folder)})
             refuse_stored_imports(config, map(key_of, rest))
             return config, folder
+
     config = make(COMMANDS[command], composed(command, rest))
     where = values.get("hydra.run.dir")
-    return config, new_folder(command) if where is None else Path(str(where.value()))
+    if where is None:
+        return config, new_folder(command)
+    return config, Path(str(where.value()))
 
 
 def new_folder(command: str) -> Path:
@@ -206,9 +226,11 @@ def call_settings(command: str, keys: Mapping[str, Any]) -> Any:
     """
     kind = COMMANDS[command]
     aliases = ALIASES.get(command, {})
-    keys = with_env_keys(kind, {aliases.get(name, name): keys[name] for name in keys})
+    keys = {aliases.get(name, name): value for name, value in keys.items()}
+    keys = with_env_keys(kind, keys)
     if command == "train" and keys.get("resume") is not None:
-        config: Any = make(kind, merged(saved_config(Path(keys["resume"]) / CONFIG), keys))
+        saved = saved_config(Path(keys["resume"]) / CONFIG)
+        config: Any = make(kind, merged(saved, keys))
         refuse_stored_imports(config, _whole_keys(keys))
         return config
     return make(kind, called(command, keys))
@@ -218,16 +240,24 @@ def call_settings(command: str, keys: Mapping[str, Any]) -> Any:
 
 
 def _sweep(command: str, overrides: list[Override]) -> None:
-    """All combinations, each in its own folder, by Hydra's launcher; all are checked before."""
+    """All combinations, each in its own folder, by Hydra's launcher; all are checked before.
+
+    Raises:
+        UserError: a mistake in any combination, or a run is to be resumed.
+        OSError: a file or disk failed in one of the runs.
+    """
     if any(word.key_or_group == "resume" for word in overrides):
         raise UserError("resume: one run is resumed at a time; start without -m.")
     checked = [settings(command, words) for words in single_runs(overrides)]
+
     # Every combination was checked above, so what fails now is a file or a disk.
     mistakes: list[Exception] = []
+    # The launcher may run jobs in processes of their own, whose lists this one does not see.
     here = os.getpid()
     sweep_folder: list[Path] = []
 
     def job(_: Any) -> None:
+        """One combination, which Hydra has put into its own configuration."""
         state = HydraConfig.get()
         sweep_folder[:] = [Path(state.sweep.dir)]
         # Without the ++ that for_hydra has put before the key.
@@ -242,10 +272,13 @@ def _sweep(command: str, overrides: list[Override]) -> None:
 
     # Hydra's launchers (joblib, submitit, ray) run the jobs; it reads its arguments from sys.argv.
     application = hydra.main(
-        version_base=VERSION_BASE, config_path=str(conf_folder()), config_name=command
+        version_base=VERSION_BASE,
+        config_path=str(conf_folder()),
+        config_name=command,
     )
     OmegaConf.register_new_resolver("process_id", os.getpid, replace=True)
-    before, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    before = sys.argv
+    full = os.environ.get("HYDRA_FULL_ERROR")
     sys.argv = [f"ganlane {command}", "-m", *for_hydra(overrides)]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # raise, rather than print and exit with status 1
     try:
@@ -260,6 +293,7 @@ def _sweep(command: str, overrides: list[Override]) -> None:
         raise mistakes[0]
     if not sweep_folder:
         return
+
     # Imported here, since they import torch, which takes seconds.
     from ganlane.evaluation.results import sweep_rows
     from ganlane.evaluation.table import show, text_table
@@ -273,6 +307,7 @@ def _sweep(command: str, overrides: list[Override]) -> None:
 
 def single_runs(overrides: Sequence[Override]) -> list[list[str]]:
     """The words of every run of a sweep: all combinations."""
+    # Of every key its words: one, or all that are swept over.
     choices: list[list[str]] = []
     for override in overrides:
         if str(override.key_or_group).startswith("hydra"):
@@ -321,13 +356,14 @@ def cleared_after_mistakes(folder: Path) -> Iterator[None]:
     A folder with results, trained weights or a checkpoint is never removed, nor one that another
     process uses.
     """
-    # A folder that was there is the user's; only what this run made may go.
+    # A folder with something in it is the user's; only what this run made may go.
     existed = folder.is_dir() and any(folder.iterdir())
     # Noted before the folder is made, which makes its parents as well.
     new_parents = [parent for parent in folder.parents if not parent.exists()]
     try:
         yield
     except (UserError, OSError):
+        # The lock is there while another process is at work.
         precious = (*EARNED, LOCK)
         if not existed and not any(any(folder.rglob(name)) for name in precious):
             shutil.rmtree(folder, ignore_errors=True)
@@ -389,6 +425,7 @@ def _locked(folder: Path) -> Iterator[None]:
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 break
         file.close()  # the process that held it has just removed the file
+
     try:
         for part in _OWN_FOLDERS:
             remove_leftovers(folder / part)  # first, since they may fill the disk
@@ -425,15 +462,17 @@ def _resumed_folder(asked: str) -> Path | None:
                 file=sys.stderr,
             )
         return folder
+
     path = Path(asked)
     if path.is_file() and path.name != LAST.name:
         raise UserError(
             f"resume={path}: a run continues from its {LAST.name} only; give the run's folder."
         )
-    # From a checkpoint upwards: its folder, perhaps that of the first phase, the run.
-    for folder in [path, *path.parents[:3]] if path.exists() else []:
-        if (folder / CONFIG).is_file() and any(folder.rglob(LAST.name)):
-            return folder
+    if path.exists():
+        # From a checkpoint upwards: its folder, perhaps that of the first phase, the run.
+        for folder in (path, *path.parents[:3]):
+            if (folder / CONFIG).is_file() and any(folder.rglob(LAST.name)):
+                return folder
     raise UserError(
         f"resume={path}: no checkpoint there ({path / LAST}); give a run's folder, its {LAST}, or "
         "auto."
@@ -442,9 +481,10 @@ def _resumed_folder(asked: str) -> Path | None:
 
 def newest_unfinished(runs: Path) -> Path | None:
     """The run with the newest checkpoint among those without results; None if there is none."""
-    # The newest checkpoint first; a run's folder is the nearest one above with settings.
+    # The newest checkpoint first.
     checkpoints = sorted(runs.rglob(LAST.name), key=lambda path: -path.stat().st_mtime)
     for checkpoint in checkpoints:
+        # A run's folder is the nearest one above with settings.
         folder = next((path for path in checkpoint.parents if (path / CONFIG).is_file()), None)
         if folder is not None and not (folder / "results.json").is_file():
             return folder
@@ -454,7 +494,9 @@ def newest_unfinished(runs: Path) -> Path | None:
 def refuse_stored_imports(config: TrainConfig, named: Iterable[str]) -> None:
     """Refuse code from outside the package that a run's file names, unless the user names it too.
 
-    ``named`` are the whole keys that stand on the command line or in the call.
+    Args:
+        config: of the run, as it would go on.
+        named: the whole keys that stand on the command line or in the call.
 
     Raises:
         UserError: the file names a class or function of another package.
@@ -463,7 +505,9 @@ def refuse_stored_imports(config: TrainConfig, named: Iterable[str]) -> None:
     # below it.
     asked = tuple(f"{name}." for name in named)
     for key, value, path in _imports(config):
-        if not f"{key}.".startswith(asked) and not path.startswith(_OWN_PACKAGES):
+        # With a dot at the end, so that no key is taken for the beginning of another one.
+        is_asked = f"{key}.".startswith(asked)
+        if not is_asked and not path.startswith(_OWN_PACKAGES):
             raise UserError(
                 f"resume={config.resume}: the run's file names {path}, and code from there would "
                 f"be executed; if you trust it, add {key}={value} to the command line."
@@ -486,6 +530,7 @@ def _imports(config: TrainConfig) -> Iterator[tuple[str, str, str]]:
                 yield f"{key}.options.{name}._target_", part._target_, part._target_
             else:
                 yield f"{key}.shares", f"{{{name}: ...}}", part._target_
+
     agents = config.evaluation.agents
     for name in agents:
         path = name.partition("+")[0]

@@ -21,8 +21,9 @@ from ganlane.errors import UserError
 
 #: In fitting, a recorded driver's target lane is its lane after this time, s.
 INTENTION_S = 2.0
-#: Arrays [T, V] of a recording, and those [V].
+#: Arrays [T, V] of a recording.
 _OF_SAMPLES = ("x", "y", "speed", "lane", "present")
+#: Arrays [V] of a recording.
 _OF_TRACKS = ("length", "width", "driven")
 
 
@@ -58,27 +59,34 @@ class Recording:
     def of(cls, rows: pl.DataFrame, lane_width_m: float) -> Recording:
         """From one scene in the schema whose tracks have no gaps.
 
-        With a column ``driven``, the other vehicles are replayed.
+        Args:
+            rows: the scene. With a column ``driven``, the vehicles that are not are replayed.
+            lane_width_m: width of its lanes, m.
         """
         rows = rows.with_columns(present=True)
         # Without the column everybody is driven.
         if "driven" not in rows.columns:
             rows = rows.with_columns(driven=True)
-        # Frames of the scene count from its first one, tracks by their number.
+
+        # Of every row: its frame, counted from the scene's first one, and its track's index.
         frame = rows["frame"].to_numpy()
         time = frame - frame.min()
-        track = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)[1]
-        shape = (int(time.max()) + 1, int(track.max()) + 1)
+        _, track = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)
+        frames = int(time.max()) + 1
+        tracks = int(track.max()) + 1
 
-        def placed(name: str, shape: tuple[int, ...], at: Any) -> Any:
+        arrays: dict[str, Any] = {}
+        # 0 where a track is absent.
+        for name in _OF_SAMPLES:
             column = rows[name].to_numpy()
-            array = np.zeros(shape, column.dtype)
-            array[at] = column
-            return array
+            arrays[name] = np.zeros((frames, tracks), column.dtype)
+            arrays[name][time, track] = column
+        # Values per track are the same in all of its rows.
+        for name in _OF_TRACKS:
+            column = rows[name].to_numpy()
+            arrays[name] = np.zeros(tracks, column.dtype)
+            arrays[name][track] = column
 
-        # 0 where a track is absent; values per track are the same in all of its rows.
-        arrays = {name: placed(name, shape, (time, track)) for name in _OF_SAMPLES}
-        arrays |= {name: placed(name, shape[1:], track) for name in _OF_TRACKS}
         scene = str(rows["scene"][0])
         # Lane 0 is the rightmost; lanes beyond the leftmost one in use are not known.
         lanes = int(rows["lane"].to_numpy().max()) + 1
@@ -95,31 +103,42 @@ class Recording:
 
         They go on at constant velocity before a vehicle's first and after its last present frame.
         """
+        positions = self.positions
         frames = np.arange(len(self.present))[:, None]
         column = np.arange(self.present.shape[1])
         first, last = self.ends
-        # The frame to go on from: itself, or the first or last one of the track.
+        # The frame to go on from, [T, V]: itself, or the first or last one of the track.
         nearest = np.clip(frames, first, last)
-        # The first and the last displacement of each vehicle; 0 where it was seen only once.
-        early = self.positions[np.minimum(first + 1, last), column] - self.positions[first, column]
-        late = self.positions[last, column] - self.positions[np.maximum(last - 1, first), column]
-        displacement = np.where((frames < first)[..., None], early, late)
+
+        # The first and the last displacement of each vehicle, m per frame, [V, 2]; 0 where it was
+        # seen only once.
+        second = np.minimum(first + 1, last)
+        last_but_one = np.maximum(last - 1, first)
+        early = positions[second, column] - positions[first, column]
+        late = positions[last, column] - positions[last_but_one, column]
+        is_before = (frames < first)[..., None]
+        displacement = np.where(is_before, early, late)
+
         # Frames since the last, or until the first, recorded one; negative before it.
         beyond = (frames - nearest)[..., None]
-        return self.positions[nearest, column] + displacement * beyond
+        return positions[nearest, column] + displacement * beyond
 
     @cached_property
     def target_lane(self) -> Integers:
         """Lane [T, V] of each vehicle after :data:`INTENTION_S`, or at the end of its track."""
-        # The frame INTENTION_S later; clipped, since the track may end before.
-        ahead = np.arange(len(self.present))[:, None] + round(INTENTION_S / FRAME_S)
-        return np.take_along_axis(self.lane, np.clip(ahead, *self.ends), axis=0)
+        frames = np.arange(len(self.present))[:, None]
+        ahead = frames + round(INTENTION_S / FRAME_S)
+        # Clipped, since the track may end before.
+        within = np.clip(ahead, *self.ends)
+        return np.take_along_axis(self.lane, within, axis=0)
 
     @property
     def ends(self) -> tuple[Integers, Integers]:
         """First and last present frame of each vehicle, [V] each."""
         # argmax is the first true entry; the last one is the first of the reversed frames.
-        return self.present.argmax(0), len(self.present) - 1 - self.present[::-1].argmax(0)
+        first = self.present.argmax(0)
+        from_end = self.present[::-1].argmax(0)
+        return first, len(self.present) - 1 - from_end
 
     @property
     def end_m(self) -> float:
@@ -134,6 +153,7 @@ class Recording:
         """
         # Simulated positions are float32; sums over them are taken in float64.
         y = self.y.astype(np.float64)
+        nearest_lane = np.rint(y / self.lane_width_m).clip(0, self.lanes - 1)
         table = track_table(
             self.name,
             self.present,
@@ -141,10 +161,11 @@ class Recording:
             x=self.x,
             y=y,
             speed=0.0,
-            lane=np.rint(y / self.lane_width_m).clip(0, self.lanes - 1),
+            lane=nearest_lane,
             length=self.length,
             width=self.width,
         )
+        # A row's vehicle is the column of its track.
         return table.with_columns(
             unit=pl.lit(self.unit),
             driven=pl.Series(self.driven[table["vehicle"].to_numpy()]),
@@ -152,34 +173,49 @@ class Recording:
         )
 
     def segments(self, seconds: float, skip_s: float = 0.0) -> list[Recording]:
-        """Pieces of ``seconds`` from ``skip_s`` on, each with the vehicles present in it."""
+        """Pieces of ``seconds`` from ``skip_s`` on, each with the vehicles present in it.
+
+        A rest that is shorter is left out. Pieces are called by their first frame, as
+        ``us-101-1@150``.
+        """
         length = round(seconds / FRAME_S)
         first = round(skip_s / FRAME_S)
+        last = len(self.x) - length
         pieces = []
-        for start in range(first, len(self.x) - length + 1, length):
+        for start in range(first, last + 1, length):
+            frames = slice(start, start + length)
             # Vehicles that are absent all the time are left out.
-            rows = slice(start, start + length)
-            who = self.present[rows].any(0)
-            arrays = {name: getattr(self, name)[rows, who] for name in _OF_SAMPLES}
-            arrays |= {name: getattr(self, name)[who] for name in _OF_TRACKS}
+            is_seen = self.present[frames].any(0)
+            arrays: dict[str, Any] = {}
+            for name in _OF_SAMPLES:
+                arrays[name] = getattr(self, name)[frames, is_seen]
+            for name in _OF_TRACKS:
+                arrays[name] = getattr(self, name)[is_seen]
             # The unit stays that of the recording: pieces of one scene are not independent.
             pieces.append(replace(self, name=f"{self.name}@{start}", **arrays))
         return pieces
 
 
 def track_table(scene: str, present: Flags, **values: ArrayLike) -> pl.DataFrame:
-    """A frame in the schema of one ``scene``, track by track.
+    """A frame in the schema of one scene, track by track.
 
-    ``values`` are the other columns but ``frame``, each [T, V], [V] or one number; rows are made
-    where ``present`` [T, V].
+    Args:
+        scene: its name.
+        present: [T, V] where rows are made.
+        **values: the other columns but ``frame``, each [T, V], [V] or one number.
     """
     # Transposed, so that the rows come track by track.
     track, frame = np.nonzero(present.T)
-    columns: dict[str, Any] = {"scene": np.full(len(frame), scene), "frame": frame}
+    columns: dict[str, Any] = {
+        "scene": np.full(len(frame), scene),
+        "frame": frame,
+    }
     for name, value in values.items():
         numbers = np.broadcast_to(value, present.shape)[frame, track]
         columns[name] = numbers.astype(SCHEMA[name].to_python())
-    return pl.DataFrame({name: columns[name] for name in SCHEMA}, schema=SCHEMA)
+    # In the order of the schema.
+    ordered = {name: columns[name] for name in SCHEMA}
+    return pl.DataFrame(ordered, schema=SCHEMA)
 
 
 def recordings_of(frame: pl.DataFrame) -> list[Recording]:
@@ -195,9 +231,13 @@ def recordings_of(frame: pl.DataFrame) -> list[Recording]:
             "ganlane.data.read_scenes."
         )
     lane_widths = scene_lane_widths(frame)
-    # Sorted by name, so that the order of the file has no effect.
     scenes = frame.partition_by("scene", as_dict=True)
-    return [Recording.of(scenes[key], lane_widths[str(key[0])]) for key in sorted(scenes)]
+    recordings = []
+    # Sorted by name, so that the order of the file has no effect.
+    for key in sorted(scenes):
+        (scene,) = key
+        recordings.append(Recording.of(scenes[key], lane_widths[str(scene)]))
+    return recordings
 
 
 def units_of(recordings: Sequence[Recording]) -> list[str]:

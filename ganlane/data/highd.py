@@ -28,6 +28,7 @@ from ganlane.data.schema import (
 from ganlane.data.tables import LINE, raise_unless_positive, raise_where, read_table
 from ganlane.errors import UserError
 
+#: How the name of a file of tracks ends, after the recording's number.
 _TRACKS = "_tracks.csv"
 #: Columns of ``XX_tracks.csv`` that are read.
 COLUMNS = {
@@ -42,14 +43,21 @@ _META = {
 }
 #: Each direction's side of the image, its ``drivingDirection``, and whether ``x`` of the image
 #: grows (1) or falls (-1) along it.
-_SIDES = (("upper", 1, -1.0), ("lower", 2, 1.0))
+_SIDES = (
+    ("upper", 1, -1.0),
+    ("lower", 2, 1.0),
+)
 
 
 @dataclass(frozen=True)
 class _Direction:
-    """One direction of travel; the first three are those of :data:`_SIDES`.
+    """One direction of travel.
 
-    ``lane_ids`` from the rightmost, ``right_edge`` is the image's ``y`` in m.
+    Attributes:
+        side, number, forward: those of :data:`_SIDES`.
+        lane_ids: of its lanes, from the rightmost.
+        right_edge: ``y`` of the image at the road's right edge, seen by its drivers, m.
+        lane_width: mean over its lanes, m.
     """
 
     side: str
@@ -63,8 +71,10 @@ class _Direction:
 def highd_scenes(path: str | Path, count: RowCount) -> Iterator[Scene]:
     """Two scenes, ``highd-XX-upper`` and ``highd-XX-lower``, for each recording.
 
-    ``path`` is an ``XX_tracks.csv`` next to its ``XX_tracksMeta.csv`` and ``XX_recordingMeta.csv``,
-    or a folder of them; rows read and dropped are added to ``count``.
+    Args:
+        path: an ``XX_tracks.csv`` next to its ``XX_tracksMeta.csv`` and ``XX_recordingMeta.csv``,
+            or a folder of them.
+        count: rows read and dropped are added to it.
 
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
@@ -80,9 +90,12 @@ def highd_scenes(path: str | Path, count: RowCount) -> Iterator[Scene]:
         if not tracks.name.endswith(_TRACKS):
             raise UserError(f"{path}: expected highD's XX{_TRACKS} or a folder of recordings.")
         stem = tracks.name.removesuffix(_TRACKS)
-        rate_hz, directions = _read_recording_meta(tracks.with_name(f"{stem}_recordingMeta.csv"))
+        recording_meta = tracks.with_name(f"{stem}_recordingMeta.csv")
+        tracks_meta = tracks.with_name(f"{stem}_tracksMeta.csv")
+
+        rate_hz, directions = _read_recording_meta(recording_meta)
         # Both directions are in one file.
-        rows = _read_rows(tracks, tracks.with_name(f"{stem}_tracksMeta.csv"), count)
+        rows = _read_rows(tracks, tracks_meta, count)
         for direction in directions:
             name = f"highd-{stem}-{direction.side}"
             scene = _scene(rows, direction, rate_hz, name, tracks, count)
@@ -100,27 +113,43 @@ def _read_recording_meta(path: Path) -> tuple[float, list[_Direction]]:
     # Frames are dropped or interpolated, never invented.
     if rate_hz < 10.0:
         raise UserError(f"{path}, line 2, column framerate: {rate_hz}, expected 10 Hz or more.")
+
     directions = []
     first_id = 2
     for side, number, forward in _SIDES:
         column = f"{side}lanemarkings"
+        # From the top of the image downwards.
         edges = _markings(meta[column], path, column)
         lanes = len(edges) - 1
         ids = range(first_id, first_id + lanes)
-        width = (edges[-1] - edges[0]) / lanes
-        # The rightmost of the upper lanes, seen by its drivers, is at the top of the image.
+        # The rightmost of the upper lanes, seen by its drivers, is at the top of the image; that of
+        # the lower lanes is at the bottom.
         from_right = slice(None, None, -int(forward))
-        right_edge = edges[from_right][0]
-        directions.append(_Direction(side, number, forward, ids[from_right], right_edge, width))
+        directions.append(
+            _Direction(
+                side,
+                number,
+                forward,
+                lane_ids=ids[from_right],
+                right_edge=edges[from_right][0],
+                lane_width=(edges[-1] - edges[0]) / lanes,
+            )
+        )
+        # One id more: that between the directions.
         first_id += lanes + 1
     return rate_hz, directions
 
 
 def _markings(text: str, path: Path, column: str) -> list[float]:
-    """``y`` of the lane markings in the image, m: ``8.51;12.59;16.43`` as numbers."""
+    """``y`` of the lane markings in the image, m: ``8.51;12.59;16.43`` as numbers.
+
+    Raises:
+        UserError: they are no growing numbers; it names the ``column`` of the file ``path``.
+    """
     try:
         markings = [float(part) for part in text.split(";") if part.strip()]
     except ValueError:
+        # Refused below, as too few are.
         markings = []
     if len(markings) < 2 or not (np.diff(markings) > 0.0).all():
         raise UserError(
@@ -140,6 +169,7 @@ def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
     what = "is neither 1 (upper lanes) nor 2 (lower lanes)"
     raise_where(unknown, cars, "drivingdirection", meta, what)
     raise_where(cars["id"].is_duplicated(), cars, "id", meta, "stands there twice")
+
     rows = read_table(path, COLUMNS)
     count.read += rows.height
     raise_unless_positive(rows, ("width", "height"), path)
@@ -147,6 +177,7 @@ def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
     step = rows.select(pl.col("frame").diff().over("id")).to_series()
     what = "is not after the last frame of its vehicle; frames must grow"
     raise_where(step <= 0, rows, "frame", path, what)
+
     # Each row gets the direction of its vehicle.
     rows = rows.join(cars.drop(LINE), on="id", how="left", maintain_order="left")
     what = "is not in the tracksMeta file"
@@ -162,7 +193,16 @@ def _scene(
     path: Path,
     count: RowCount,
 ) -> Scene | None:
-    """One direction in the schema, with a frame every 0.1 s; None where it has no vehicles."""
+    """One direction in the schema, with a frame every 0.1 s; None where it has no vehicles.
+
+    Args:
+        rows: of both directions, as recorded.
+        direction: the one that is wanted.
+        rate_hz: frames per second of the recording.
+        name: of the scene.
+        path: file that a mistake is reported of.
+        count: rows dropped are added to it.
+    """
     rows = rows.filter(pl.col("drivingdirection") == direction.number)
     # A lane id of the other direction, or none, is an error of the tracking.
     on_road = rows["laneid"].is_in(list(direction.lane_ids))
@@ -170,7 +210,9 @@ def _scene(
     rows = rows.filter(on_road)
     if rows.is_empty():
         return None
-    # Distances grow in the direction of travel.
+
+    # Distances grow in the direction of travel. The file has the upper left corner of a vehicle's
+    # box, the schema its centre.
     forward = direction.forward
     along = forward * (pl.col("x") + 0.5 * pl.col("width"))
     # Upper lanes: left is down in the image, where y grows; lower lanes: left is up.
@@ -187,6 +229,7 @@ def _scene(
         length="width",
         width="height",
     )
+
     # Rows that were dropped split a track: nothing is interpolated across a gap.
     tracks = number_tracks(turned, str(path)).partition_by("vehicle", maintain_order=True)
     frame = pl.concat([resample(track, rate_hz) for track in tracks])
@@ -199,18 +242,21 @@ def resample(track: pl.DataFrame, rate_hz: float) -> pl.DataFrame:
 
     Frame 0 is the old frame 0; no sample lies beyond the ends of the track.
     """
+    # Old frames in a new one.
     per_step = rate_hz * FRAME_S
     old = track["frame"].to_numpy()
     # A small tolerance, so that a new frame at the time of an old one stays in spite of rounding.
     first = np.ceil(old[0] / per_step - 1e-9)
     last = np.floor(old[-1] / per_step + 1e-9)
     frame = np.arange(first, last + 1.0)
+
     # Places of the new frames among the old samples.
     place = (frame * per_step - old[0]).clip(0.0, len(old) - 1)
+    # Half way between two samples, the earlier one counts.
     nearest = np.ceil(place - 0.5 - 1e-9).astype(np.int64)
     # Numbers are interpolated; lane and names are those of the nearest sample.
-    columns = {
-        name: np.interp(place, np.arange(len(old)), track[name].to_numpy())
-        for name in ("x", "y", "speed", "length", "width")
-    }
+    samples = np.arange(len(old))
+    columns = {}
+    for name in ("x", "y", "speed", "length", "width"):
+        columns[name] = np.interp(place, samples, track[name].to_numpy())
     return track[nearest].with_columns(frame=frame.astype(np.int64), **columns)

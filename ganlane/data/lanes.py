@@ -33,11 +33,12 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-#: Samples, 0.1 s each: least in the old lane before a change and in the new one after it; half the
-#: window of the mean lateral speed; longest search for start and end, before and after the
-#: crossing.
+# In samples, 0.1 s each.
+#: Least in the old lane before a change and in the new one after it.
 _HOLD = 5
+#: Half the window of the mean lateral speed.
 _HALF_WINDOW = 5
+#: Longest search for start and end, before and after the crossing.
 _REACH = 200
 #: Offset from the lane's centre and lateral speed below which the change has not begun or is over,
 #: m and m/s.
@@ -50,17 +51,17 @@ def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
 
     Errors are :func:`lane_width`'s.
     """
-    return {
-        str(name): lane_width(rows["y"].to_numpy(), rows["lane"].to_numpy(), str(name))
-        for (name,), rows in frame.group_by("scene", maintain_order=True)
-    }
+    widths = {}
+    for (name,), rows in frame.group_by("scene", maintain_order=True):
+        scene = str(name)
+        widths[scene] = lane_width(rows["y"].to_numpy(), rows["lane"].to_numpy(), scene)
+    return widths
 
 
 def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
     """Number of lanes of every scene of a frame in the schema: its highest lane number plus one."""
-    return dict(
-        frame.group_by("scene", maintain_order=True).agg(pl.col("lane").max() + 1).iter_rows()
-    )
+    scenes = frame.group_by("scene", maintain_order=True)
+    return dict(scenes.agg(pl.col("lane").max() + 1).iter_rows())
 
 
 def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
@@ -70,7 +71,12 @@ def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
     and Sen), which is robust to outliers. It is kept if no other width within 10 % of it puts more
     rows into their recorded lane; otherwise the result is the middle of the best range. Lane
     changes make that range narrow, since a vehicle's lane number changes just where it crosses the
-    boundary. ``y`` [R] in m is 0 at the centre of lane 0.
+    boundary.
+
+    Args:
+        y: [R] m, 0 at the centre of lane 0.
+        lane: [R] as recorded.
+        scene: its name, for messages.
 
     Raises:
         UserError: the estimate is below 2 m or above 6 m.
@@ -84,9 +90,12 @@ def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
             f"{scene}: its lanes are {guess:.2f} m apart, expected 2 to 6 m; check that y is in "
             "metres, grows to the left, and that lanes are numbered in order."
         )
+
     # Then the range of widths that explains most recorded lane numbers.
     low, high = _best_range(y, lane, guess)
-    return guess if low <= guess <= high else 0.5 * (low + high)
+    if low <= guess <= high:
+        return guess
+    return 0.5 * (low + high)
 
 
 def lane_grid(y: Floats, lane: Integers, scene: str) -> tuple[float, float]:
@@ -94,30 +103,40 @@ def lane_grid(y: Floats, lane: Integers, scene: str) -> tuple[float, float]:
     origin.
 
     Each lane's median position gives an estimate of the centre; their median is returned.
+
+    Raises:
+        UserError: see :func:`lane_width`.
     """
     numbers, centres = _centres(y, lane)
     spacing = _median_spacing(numbers, centres)
-    from_0 = y - lane * STANDARD_LANE_WIDTH_M if spacing is None else centres - numbers * spacing
-    centre = float(np.median(from_0))
+    # Estimates of lane 0's centre: of every row where there is one lane, else of every lane.
+    estimates = y - lane * STANDARD_LANE_WIDTH_M
+    if spacing is not None:
+        estimates = centres - numbers * spacing
+    centre = float(np.median(estimates))
     return lane_width(y - centre, lane, scene), centre
 
 
 def _best_range(y: Floats, lane: Integers, guess: float) -> tuple[float, float]:
-    """Widths within 10 % of the guess that most rows agree with.
+    """Widths within 10 % of the guess that most rows agree with, from the least to the greatest.
 
     Of several ranges, the nearest to the guess.
     """
     # A row of lane k agrees with the widths from y / (k + 1/2) to y / (k - 1/2); lane 0 has no
     # upper end.
-    begin = np.where(lane == 0, 2.0 * np.abs(y), y / (lane + 0.5))
-    end = np.where(lane == 0, np.inf, y / (lane - 0.5))
     limits = (0.9 * guess, 1.1 * guess)
-    begin, end = np.clip(begin, *limits), np.clip(end, *limits)
-    # The number of agreeing rows changes at these widths only.
+    begin = np.where(lane == 0, 2.0 * np.abs(y), y / (lane + 0.5)).clip(*limits)
+    end = np.where(lane == 0, np.inf, y / (lane - 0.5)).clip(*limits)
+
+    # The number of agreeing rows changes at these widths only, so one width between two of them
+    # stands for all.
     edges = np.unique(np.concatenate((begin, end, limits)))
     inside = 0.5 * (edges[1:] + edges[:-1])
     # Rows whose range has begun, less those whose range has ended.
-    agreeing = np.searchsorted(np.sort(begin), inside) - np.searchsorted(np.sort(end), inside)
+    begun = np.searchsorted(np.sort(begin), inside)
+    ended = np.searchsorted(np.sort(end), inside)
+    agreeing = begun - ended
+
     best = np.flatnonzero(agreeing == agreeing.max())
     nearest = best[np.argmin(np.abs(inside[best] - guess))]
     return float(edges[nearest]), float(edges[nearest + 1])
@@ -129,14 +148,17 @@ def _median_spacing(numbers: Integers, centres: Floats) -> float | None:
         return None
     # All pairs of lanes.
     one, other = np.triu_indices(len(numbers), 1)
-    return float(np.median((centres[other] - centres[one]) / (numbers[other] - numbers[one])))
+    distances = centres[other] - centres[one]
+    lanes_apart = numbers[other] - numbers[one]
+    return float(np.median(distances / lanes_apart))
 
 
 def _centres(y: Floats, lane: Integers) -> tuple[Integers, Floats]:
     """Lanes with enough rows (0.5 s of one vehicle), and their median positions."""
     numbers, rows = np.unique(lane, return_counts=True)
     numbers = numbers[rows >= 5]
-    return numbers, np.array([np.median(y[lane == number]) for number in numbers])
+    medians = np.array([np.median(y[lane == number]) for number in numbers])
+    return numbers, medians
 
 
 @dataclass(frozen=True)
@@ -162,13 +184,17 @@ class Tracks:
     @property
     def first(self) -> Integers:
         """[R] index of the first sample of each sample's track."""
-        return np.maximum.accumulate(np.where(self.begins, np.arange(len(self.y)), 0))
+        # The greatest beginning so far.
+        beginnings = np.where(self.begins, np.arange(len(self.y)), 0)
+        return np.maximum.accumulate(beginnings)
 
     @property
     def last(self) -> Integers:
         """[R] index of the last sample of each sample's track."""
+        # A track ends one sample before the next begins.
         ends = np.append(np.flatnonzero(self.begins)[1:], len(self.y)) - 1
-        return ends[np.cumsum(self.begins) - 1]
+        number = np.cumsum(self.begins) - 1
+        return ends[number]
 
 
 def tracks_of_frame(
@@ -177,12 +203,16 @@ def tracks_of_frame(
 ) -> Tracks:
     """Tracks of a frame in the schema, sorted.
 
-    Each scene's lane width in m is estimated where not given.
+    Args:
+        frame: what is measured; of its columns ``y``, ``scene``, ``vehicle`` and ``frame``.
+        lane_widths: of each scene, m; None: they are estimated.
     """
     widths = scene_lane_widths(frame) if lane_widths is None else lane_widths
     # A track goes on where frame and vehicle say so, within one scene; null in the first row.
-    next_frame = (pl.col("frame").diff() == 1) & (pl.col("vehicle").diff() == 0)
-    goes_on = next_frame & (pl.col("scene") == pl.col("scene").shift(1))
+    is_next_frame = pl.col("frame").diff() == 1
+    same_vehicle = pl.col("vehicle").diff() == 0
+    same_scene = pl.col("scene") == pl.col("scene").shift(1)
+    goes_on = is_next_frame & same_vehicle & same_scene
     columns = frame.select(
         "y",
         width=pl.col("scene").replace_strict(widths, return_dtype=pl.Float64),
@@ -237,9 +267,14 @@ def find_lane_changes(tracks: Tracks) -> LaneChanges:
     new = lane[sample + 1]
     # 1 to the left, -1 to the right.
     side = np.sign(new - old)
-    # The crossing lies between two samples; it is interpolated linearly.
+
+    # The crossing lies between two samples; it is interpolated linearly. ``part`` is the share of
+    # the 0.1 s between them.
     boundary = (old + 0.5 * side) * tracks.lane_width[sample]
-    part = (boundary - tracks.y[sample]) / (tracks.y[sample + 1] - tracks.y[sample])
+    y_before = tracks.y[sample]
+    y_after = tracks.y[sample + 1]
+    part = (boundary - y_before) / (y_after - y_before)
+
     start, start_seen = _find_end(tracks, sample, side, old, -1)
     end, end_seen = _find_end(tracks, sample + 1, side, new, 1)
     tau_s = (sample - start + part) * FRAME_S
@@ -256,10 +291,13 @@ def _crossings(lane: Integers, tracks: Tracks) -> Integers:
     starts_run = tracks.begins | (np.diff(lane, prepend=lane[:1]) != 0)
     lengths = np.diff(np.flatnonzero(starts_run), append=len(lane))
     long_enough = lengths >= _HOLD
+    # Of each sample, [R]: the number of its run.
     run = np.cumsum(starts_run) - 1
     # Samples at which a new run begins within the same track.
     after = np.flatnonzero(starts_run & ~tracks.begins)
-    return after[long_enough[run[after]] & long_enough[run[after - 1]]] - 1
+    stays_before = long_enough[run[after - 1]]
+    stays_after = long_enough[run[after]]
+    return after[stays_before & stays_after] - 1
 
 
 def _find_end(
@@ -272,22 +310,36 @@ def _find_end(
     """Start (``direction`` -1) or end (1) of lane changes.
 
     It is the first sample that is centred or without lateral movement.
-    Returns [C] the samples, or the first or last ones of their tracks, and [C] whether the end lies
-    within the track.
+
+    Args:
+        tracks: all samples.
+        sample: [C] where the search begins, next to the crossing.
+        side: [C] of the change: 1 to the left, -1 to the right.
+        lane: [C] the lane that is left or reached.
+        direction: of the search in time.
+
+    Returns:
+        [C] the samples, or the first or last ones of their tracks, and [C] whether the end lies
+        within the track.
     """
-    # Never beyond the track: there the change is censored.
+    # [C, steps]: the samples that are searched, in this order. Never beyond the track: there the
+    # change is censored.
     limit = (tracks.first if direction < 0 else tracks.last)[sample, None]
     path = sample[:, None] + direction * np.arange(_REACH + 1)
     inside = direction * (limit - path) >= 0
     path = np.where(inside, path, limit)
+
     # Distance from the centre of the lane that is left or reached.
-    offset = tracks.y[path] - (lane * tracks.lane_width[sample])[:, None]
-    # Recorded positions are noisy.
+    centre = lane * tracks.lane_width[sample]
+    offset = tracks.y[path] - centre[:, None]
+    # Towards the new lane; a mean, since recorded positions are noisy.
     pace = side[:, None] * mean_speed(tracks.y, tracks, path)
-    done = inside & ((np.abs(offset) < _CENTRED_M) | (pace < _STILL_MPS))
-    within = done.any(axis=1)
-    at = np.where(within, done.argmax(axis=1), inside.sum(axis=1) - 1)
-    return sample + direction * at, within
+    is_done = inside & ((np.abs(offset) < _CENTRED_M) | (pace < _STILL_MPS))
+
+    # argmax is the first true entry.
+    within = is_done.any(axis=1)
+    steps = np.where(within, is_done.argmax(axis=1), inside.sum(axis=1) - 1)
+    return sample + direction * steps, within
 
 
 def mean_speed(position: Floats, tracks: Tracks, at: Integers) -> Floats:
@@ -297,4 +349,6 @@ def mean_speed(position: Floats, tracks: Tracks, at: Integers) -> Floats:
     """
     before = np.maximum(at - _HALF_WINDOW, tracks.first[at])
     after = np.minimum(at + _HALF_WINDOW, tracks.last[at])
-    return (position[after] - position[before]) / (np.maximum(after - before, 1) * FRAME_S)
+    # A track of one sample has no speed: 0.
+    samples = np.maximum(after - before, 1)
+    return (position[after] - position[before]) / (samples * FRAME_S)

@@ -39,7 +39,9 @@ from ganlane.data.tables import (
 from ganlane.errors import UserError
 from ganlane.settings.generator import MOTORWAYS, NgsimParameters
 
+#: Metres in a foot.
 FOOT_M = 0.3048
+#: Time between two frames, ms.
 FRAME_MS = 100
 #: The 18 columns of the raw text files, which have no header.
 RAW_NAMES = (
@@ -96,10 +98,13 @@ def ngsim_scenes(
 ) -> Iterator[Scene]:
     """The periods of an NGSIM file, one scene each, in bounded memory (a block, then a period).
 
-    ``path`` is a raw text file (18 columns, no header), or a CSV with NGSIM's column names in any
-    case and order; with a column ``location`` it may hold several locations. Rows read and dropped
-    are added to ``count``; ``scratch`` is a folder for temporary files, which are removed at the
-    end, by default the system's.
+    Args:
+        path: a raw text file (18 columns, no header), or a CSV with NGSIM's column names in any
+            case and order; with a column ``location`` it may hold several locations.
+        parameters: locations and lanes that are wanted, and bytes of a block.
+        count: rows read and dropped are added to it.
+        scratch: folder for temporary files, which are removed at the end; None: the system's.
+        on_progress: called after each block.
 
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
@@ -142,14 +147,17 @@ def _read_rows(
     """Blocks with :data:`COLUMNS`, ``location`` and ``line``, in feet, in the order of the file."""
     path = table.path
     has_location = LOCATION in table.names
-    wanted = [*COLUMNS, LOCATION] if has_location else list(COLUMNS)
+    wanted = list(COLUMNS)
+    if has_location:
+        wanted.append(LOCATION)
     for text in read_blocks(table, wanted, parameters.block_bytes, on_progress):
         count.read += text.height
-        # A raw text file is of one place, which its name tells.
         if has_location:
             text = _keep_locations(text, path, parameters.locations, count)
         else:
+            # A raw text file is of one place, which its name tells.
             text = text.with_columns(pl.lit(path.stem).alias(LOCATION))
+
         # Only the wanted rows are converted: others may be damaged.
         rows = converted(text, COLUMNS, path).with_columns(text[LOCATION])
         raise_unless_positive(rows, ("v_length", "v_width"), path)
@@ -169,6 +177,7 @@ def _keep_locations(
     what = f"is no known place, expected {', '.join(places)}, or name it in data.locations"
     # A mistyped place would drop a whole recording in silence.
     raise_where(~text[LOCATION].is_in(places), text, LOCATION, path, what)
+
     wanted = text[LOCATION].is_in(list(locations))
     for location, rows in text[LOCATION].filter(~wanted).value_counts().iter_rows():
         count.drop(f"location {location}", rows)
@@ -182,9 +191,20 @@ def _store_by_period(
 ) -> dict[str, list[Path]]:
     """Store the rows of all blocks under ``folder``.
 
-    Returns the files of each period by its name, as ``us-101-1``.
+    Args:
+        blocks: rows as :func:`_read_rows` gives them.
+        folder: where files are written.
+        source: name of the recording, for messages.
+
+    Returns:
+        The files of each period by its name, as ``us-101-1``.
+
+    Raises:
+        UserError: times or frames that make no periods.
     """
+    # By location and minute of frame 0.
     parts: dict[tuple[Any, ...], list[Path]] = {}
+    # The time of frame 0, the same for all rows of a period.
     start_ms = pl.col("global_time") - FRAME_MS * pl.col("frame_id")
     for number, block in enumerate(blocks):
         block = block.with_columns(minute=start_ms // 60_000)
@@ -201,12 +221,16 @@ def _store_by_period(
                 "periods or more; expected global_time in milliseconds and frame_id in steps of "
                 "100 ms."
             )
-    # Adjacent minutes are one period.
+
+    # Adjacent minutes are one period: a location's number grows where the minute before is empty.
     periods: dict[str, list[Path]] = {}
     numbers = Counter[str]()
     for location, minute in sorted(parts):
-        numbers[location] += (location, minute - 1) not in parts
-        periods.setdefault(f"{location}-{numbers[location]}", []).extend(parts[location, minute])
+        if (location, minute - 1) not in parts:
+            numbers[location] += 1
+        name = f"{location}-{numbers[location]}"
+        periods.setdefault(name, []).extend(parts[location, minute])
+
     for name, files in periods.items():
         location = name.rpartition("-")[0]
         if numbers[location] == 1 or len(files) > 1:
@@ -235,24 +259,37 @@ def _scene(
     lanes: int,
     count: RowCount,
 ) -> Scene | None:
-    """The ``rows`` of one period in the schema; None where none of them is on a lane."""
+    """The ``rows`` of one period in the schema; None where none of them is on a lane.
+
+    Args:
+        name: of the period.
+        rows: in feet, in any order.
+        path: the file that they were read from.
+        lanes: NGSIM's number of the last lane that is kept.
+        count: rows dropped are added to it.
+    """
     source = f"{path}, {name}"
     rows = _drop_duplicates(rows, count)
     _check_order(rows, path)
     _check_units(rows, source)
+
     # Rows beyond the lanes that are kept end a track.
     count.drop("lane below 1", (rows["lane_id"] < 1).sum())
     count.drop("ramp", (rows["lane_id"] > lanes).sum())
     rows = rows.filter(rows["lane_id"].is_between(1, lanes))
     if rows.is_empty():
         return None
+
     # NGSIM counts lanes from the left, from 1.
     from_left = rows["lane_id"].to_numpy() - 1
     right_m = FOOT_M * rows["local_x"].to_numpy()
-    # Every n-th row is enough to estimate the lanes, and bounds the memory.
-    part = slice(None, None, -(-len(right_m) // ROWS_FOR_LANES))
-    width, first_centre = lane_grid(right_m[part], from_left[part], source)
+    # Every n-th row is enough to estimate the lanes, and bounds the memory; -(-a // b) is a / b
+    # rounded up.
+    every = -(-len(right_m) // ROWS_FOR_LANES)
+    width, first_centre = lane_grid(right_m[::every], from_left[::every], source)
+    # From the left the last one is the rightmost.
     last = int(from_left.max())
+
     # Front centres in feet become centres of the body in metres.
     frame = rows.select(
         scene=pl.lit(name),
@@ -271,7 +308,8 @@ def _scene(
 def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
     """Rows by vehicle and time.
 
-    Of several rows of one vehicle at one time the first in the file is kept.
+    Of several rows of one vehicle at one time the first in the file stays; equal and other ones are
+    counted apart.
     """
     # The file's own order decides which of several rows is the first.
     rows = rows.sort("vehicle_id", "global_time", LINE)
@@ -283,17 +321,26 @@ def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
 
 
 def _check_order(rows: pl.DataFrame, path: Path) -> None:
-    """Frames must grow with time, and be 100 ms apart."""
+    """Frames must grow with time, and be 100 ms apart.
+
+    Raises:
+        UserError: at the first row for which that is not so.
+    """
     steps = rows.select(pl.col("frame_id", "global_time").diff().over("vehicle_id"))
     what = "does not grow with global_time within its vehicle"
     raise_where(steps["frame_id"] <= 0, rows, "frame_id", path, what)
+
     apart = steps["global_time"] != FRAME_MS * steps["frame_id"]
     what = "is not 100 ms a frame after the row before"
     raise_where(apart, rows, "global_time", path, what)
 
 
 def _check_units(rows: pl.DataFrame, source: str) -> None:
-    """Lengths, positions or speeds that cannot be in feet and seconds."""
+    """Lengths, positions and speeds must be in feet and seconds.
+
+    Raises:
+        UserError: they cannot be.
+    """
     # Any line of the period will do: the unit is that of the whole column.
     line = int(rows[LINE].min())  # type: ignore[arg-type]
     length = float(rows["v_length"].median())  # type: ignore[arg-type]
@@ -303,6 +350,7 @@ def _check_units(rows: pl.DataFrame, source: str) -> None:
             f"{source}, from line {line}, column v_length: the median is {length:.1f}, expected "
             f"feet, about 15; they look like {guess}, convert all columns to feet."
         )
+
     # The pace is distance over speed times time, 1 in consistent units.
     distance = pl.col("local_y").last() - pl.col("local_y").first()
     seconds = (pl.col("global_time").last() - pl.col("global_time").first()) / 1000.0
@@ -312,8 +360,10 @@ def _check_units(rows: pl.DataFrame, source: str) -> None:
         rows=pl.len(),
         speed=speed,
     )
-    moving = per_vehicle.filter((pl.col("rows") >= _PACE_FRAMES) & (pl.col("speed") >= _PACE_FT_S))
-    pace = moving["pace"].median()
+    is_long = pl.col("rows") >= _PACE_FRAMES
+    is_moving = pl.col("speed") >= _PACE_FT_S
+    # None where nobody moves.
+    pace = per_vehicle.filter(is_long & is_moving)["pace"].median()
     if isinstance(pace, float) and not PACE[0] <= pace <= PACE[1]:
         raise UserError(
             f"{source}, from line {line}, columns local_y and v_vel: vehicles cover {pace:.2f} "

@@ -28,13 +28,16 @@ ONE_LANE_FILES = {
     "I-80, following": "i80_following.csv",
     "I-24": "../i24/instrumented.csv",
 }
+#: Length of a segment, s.
 SEGMENT_S = 15.0
 #: The first seconds of a pair, in which the published smoothing bends the follower's speed, s.
 EDGE_S = 3.0
+#: Of a car whose size the file does not say.
 _LENGTH_M = 4.5
 _WIDTH_M = 2.0
 #: No leader comes nearer, or gets away, by more than this within 0.1 s, m.
 _JUMP_M = 2.0
+#: Columns that two of the files have in common.
 _NUMBERS = {
     "vehicle": pl.Int64,
     "frame": pl.Int64,
@@ -57,20 +60,27 @@ def read_one_lane(name: str, path: Path) -> list[Recording]:
     # A scene is the lane, or a pair of cars.
     rows = _READERS[name](path)
     whole_lane = name == "I-80, lane_1"
+    skip_s = 0.0 if whole_lane else EDGE_S
     pieces = []
     for scene in rows.partition_by("scene", maintain_order=True):
-        for piece in _one_lane(scene).segments(SEGMENT_S, 0.0 if whole_lane else EDGE_S):
+        for piece in _one_lane(scene).segments(SEGMENT_S, skip_s):
+            # Nobody is driven where only a leader is there.
+            if not piece.driven.any():
+                continue
             # Each segment of the lane is a unit of its own: the whole lane would be a single unit,
             # and gives no interval.
             unit = piece.name if whole_lane else piece.unit
-            if piece.driven.any():
-                pieces.append(replace(piece, unit=unit))
+            pieces.append(replace(piece, unit=unit))
     if not pieces:
         raise UserError(f"{path}: nothing in it lasts {SEGMENT_S:g} s; give the whole file.")
     return pieces
 
 
+# --- the readers: scene, vehicle, frame, x of the centre, length, and whether it is driven
+
+
 def _lane(path: Path) -> pl.DataFrame:
+    """Every car of I-80's lane 1."""
     return read_table(path, _NUMBERS).with_columns(
         scene=pl.lit("lane_1"),
         length=pl.lit(_LENGTH_M),
@@ -80,6 +90,7 @@ def _lane(path: Path) -> pl.DataFrame:
 
 
 def _pairs(path: Path) -> pl.DataFrame:
+    """Pairs of cars on I-80; a row is one car of a pair."""
     columns = {
         "pair": pl.String,
         "role": pl.String,
@@ -94,18 +105,20 @@ def _pairs(path: Path) -> pl.DataFrame:
 
 
 def _following(path: Path) -> pl.DataFrame:
-    # Both cars of a pair are in one row.
+    """Pairs of cars on I-80; a row is both cars of a pair."""
     columns = {
         "period": pl.String,
         **dict.fromkeys(("follower", "leader", "frame"), pl.Int64),
         **dict.fromkeys(("x_follower", "x_leader", "leader_length"), pl.Float64),
     }
     table = read_table(path, columns)
+    # The follower's length is not in the file.
+    lengths = {
+        "follower": pl.lit(_LENGTH_M),
+        "leader": pl.col("leader_length"),
+    }
     cars = []
-    for role, length in (
-        ("follower", pl.lit(_LENGTH_M)),
-        ("leader", pl.col("leader_length")),
-    ):
+    for role, length in lengths.items():
         car = table.select(
             "frame",
             scene=pl.concat_str("period", "follower", "leader", separator="-"),
@@ -119,7 +132,12 @@ def _following(path: Path) -> pl.DataFrame:
 
 
 def _instrumented(path: Path) -> pl.DataFrame:
-    columns = {"drive": pl.String, "time_s": pl.Float64, "v": pl.Float64}
+    """Drives of a car on I-24 that measured its own speed and the gap to its leader."""
+    columns = {
+        "drive": pl.String,
+        "time_s": pl.Float64,
+        "v": pl.Float64,
+    }
     table = read_table(path, columns)
     # Where nobody was seen there is no number, so this column is not checked.
     gap = pl.read_csv(path, columns=["gap"], schema_overrides={"gap": pl.Float64})
@@ -131,6 +149,7 @@ def _instrumented(path: Path) -> pl.DataFrame:
         x=(pl.col("v").cum_sum() * FRAME_S).over("drive"),
     )
     follower = drives.select("scene", "frame", "x", vehicle=0, driven=True)
+
     # A gap that jumps belongs to another leader.
     another = (pl.col("gap").diff().abs() > _JUMP_M).fill_null(True)
     leaders = drives.filter(pl.col("gap").is_not_null()).select(
@@ -163,8 +182,10 @@ def _one_lane(rows: pl.DataFrame) -> Recording:
     rows = rows.sort("vehicle", "frame")
     # Positions across the road are not given, and all lanes are alike.
     rows = rows.with_columns(y=0.0, lane=0, width=_WIDTH_M)
-    tracks = tracks_of_frame(rows, {rows["scene"][0]: STANDARD_LANE_WIDTH_M})
+    lane_widths = {rows["scene"][0]: STANDARD_LANE_WIDTH_M}
+    tracks = tracks_of_frame(rows, lane_widths)
     speed = mean_speed(rows["x"].to_numpy(), tracks, np.arange(len(rows)))
+
     # A gap splits a track, since a recording's tracks have none.
     rows = rows.with_columns(vehicle=pl.Series(tracks.begins).cum_sum(), speed=pl.Series(speed))
     return Recording.of(rows, STANDARD_LANE_WIDTH_M)

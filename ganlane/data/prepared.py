@@ -32,6 +32,7 @@ from ganlane.settings.generator import NgsimParameters
 
 #: Accelerations beyond it, which few cars reach, are strong, m/s2.
 _STRONG_MPS2 = 3.0
+#: Those of the :func:`quantities` that may be strong.
 _ACCELERATIONS = ("acceleration_raw", "acceleration_smoothed")
 
 
@@ -52,31 +53,36 @@ class PooledStatistics:
         self.written = 0
         self.files: list[str] = []
         self.scenes: list[dict[str, Any]] = []
+        # Of each scene, in the order in which they were added.
         self._exposures: list[Exposure] = []
         self._changes: list[LaneChanges] = []
         self._samples: list[dict[str, np.ndarray]] = []
 
     def add(self, scene: Scene) -> dict[str, Any]:
-        """Measure one more scene."""
+        """Measure one more scene; its numbers, as in ``scenes``."""
         frame = scene.frame
         exposure = measure_exposure(frame)
         tracks = tracks_of_frame(frame, {scene.name: scene.lane_width_m})
         changes = find_lane_changes(tracks)
-        self._exposures.append(exposure)
-        self._changes.append(changes)
         # Numbers of their own, which do not hold on to the frame.
         samples = {name: values.copy() for name, values in quantities(frame).items()}
+        self._exposures.append(exposure)
+        self._changes.append(changes)
         self._samples.append(samples)
+
         # A scene's own rates, for the table.
         rates = lane_change_statistics(changes, exposure, samples["speed"])
+        # From the first frame to the last, both included.
+        frames = int(np.ptp(frame["frame"].to_numpy()) + 1)
+        is_nearest = tracks.lane == frame["lane"].to_numpy()
         summary = {
             "name": scene.name,
             "rows": frame.height,
             "tracks": exposure.tracks,
-            "seconds": round(FRAME_S * int(np.ptp(frame["frame"].to_numpy()) + 1), 1),
+            "seconds": round(FRAME_S * frames, 1),
             "lanes": scene.lanes,
             "lane_width_m": scene.lane_width_m,
-            "nearest_lane_share": float(np.mean(tracks.lane == frame["lane"].to_numpy())),
+            "nearest_lane_share": float(np.mean(is_nearest)),
             "vehicle_km": exposure.vehicle_km,
             "mean_speed_mps": float(samples["speed"].mean()),
             "lane_changes": rates.count,
@@ -92,15 +98,17 @@ class PooledStatistics:
     def exposure(self) -> Exposure:
         """Total amount of driving; the road's length is the mean over the cars."""
         parts = _columns(self._exposures)
-        # Weighted by cars, as equation 9 counts them.
+        # Weighted by cars, as equation 9 counts them; all the others are sums.
         road_m = float(np.average(parts.pop("road_m"), weights=parts["cars"]))
-        return Exposure(road_m=road_m, **{name: sum(values) for name, values in parts.items()})
+        totals = {name: sum(values) for name, values in parts.items()}
+        return Exposure(road_m=road_m, **totals)
 
     @property
     def changes(self) -> LaneChanges:
         """All lane changes; ``sample`` counts within each scene."""
         parts = _columns(self._changes)
-        return LaneChanges(**{name: np.concatenate(values) for name, values in parts.items()})
+        arrays = {name: np.concatenate(values) for name, values in parts.items()}
+        return LaneChanges(**arrays)
 
     @property
     def lane_changes(self) -> LaneChangeStatistics:
@@ -117,7 +125,13 @@ class PooledStatistics:
         return float(strong.mean()) if len(strong) else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain numbers and dataclasses, for ``results.json``."""
+        """Everything as plain numbers and dataclasses, for ``results.json``.
+
+        Returns:
+            ``rows`` (read, kept, dropped by reason, written), ``files``, ``exposure``,
+            ``lane_changes``, a distribution of each of the :func:`quantities`, shares of strong
+            accelerations, and ``scenes``.
+        """
         rows = {
             "read": self.count.read,
             "kept": self.count.kept,
@@ -153,9 +167,17 @@ def prepare_recordings(
 ) -> PooledStatistics:
     """Read recordings, write each as a Parquet file into the new folder ``out``, and measure them.
 
-    The folder appears only when everything is written. Recordings are measured first, then cut into
-    scenes of ``scene_s`` seconds if it is given. The other arguments are those of
-    :func:`open_scenes`.
+    The folder appears only when everything is written.
+
+    Args:
+        kind, path, parameters, on_progress: those of :func:`open_scenes`.
+        out: the folder.
+        scene_s: recordings are cut into scenes of so many seconds, after they were measured; None:
+            they stay whole.
+        on_scene: called with the numbers of each recording, when it is written.
+
+    Returns:
+        What was measured and written.
 
     Raises:
         UserError: a damaged or missing file, no moving vehicle in it, or ``out`` exists already.
@@ -169,17 +191,20 @@ def prepare_recordings(
                 pooled.count.drop("scene in which nobody drives", scene.frame.height)
                 continue
             summary = pooled.add(scene)
+
             # Letters, digits, dots and dashes.
             file = re.sub(r"[^\w.-]+", "_", scene.name).lstrip(".") + PARQUET
             if file in pooled.files:
                 raise UserError(f"{path}: a second scene that {file} is the file of; rename one.")
             pooled.files.append(file)
+
             # Measured whole: cutting would censor lane changes.
             frame = cut_into_scenes(scene.frame, scene_s) if scene_s else scene.frame
             write_prepared(frame, folder / file)
             pooled.written += frame.height
             if on_scene is not None:
                 on_scene(summary)
+
         if not pooled.files:
             raise UserError(
                 f"{path}: no scene in which anybody drives; give a recording of moving traffic."

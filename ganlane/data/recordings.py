@@ -24,6 +24,7 @@ from ganlane.settings.generator import NgsimParameters
 #: Columns of a scene CSV: the schema's, but the speed is ``v``; ``y`` is positive to the left and 0
 #: at the centre of lane 1, which is the leftmost.
 COLUMNS = {"v" if name == "speed" else name: kind for name, kind in SCHEMA.items()}
+#: Ending of the files that ``ganlane prepare`` writes.
 PARQUET = ".parquet"
 #: How a Parquet file begins.
 _PARQUET = b"PAR1"
@@ -35,8 +36,9 @@ def read_scenes(path: str | Path) -> pl.DataFrame:
     Lanes of a CSV are renumbered from the right (a scene's highest number becomes 0), and ``y`` is
     shifted so that it is 0 at the centre of that lane. Positions are not smoothed.
 
-    ``path``: CSV with :data:`COLUMNS` (others are ignored), in metres, m/s and 0.1 s a frame; or
-    Parquet in the schema, a file ``*.parquet`` or a folder of them.
+    Args:
+        path: CSV with :data:`COLUMNS` (others are ignored), in metres, m/s and 0.1 s a frame; or
+            Parquet in the schema, a file ``*.parquet`` or a folder of them.
 
     Raises:
         UserError: a missing or damaged file, or a scene in two files; the message names file, line
@@ -86,8 +88,10 @@ def _read_files(path: Path) -> Iterator[pl.DataFrame]:
 
 
 def _read_csv(path: Path) -> pl.DataFrame:
+    """A scene CSV in the schema: ``y`` and lanes from the right."""
     table = read_table(path, COLUMNS).rename({"v": "speed"})
     raise_where(table["lane"] < 1, table, "lane", path, "is below 1, the leftmost lane")
+
     scenes = []
     for (name,), scene in validate(table, str(path)).group_by("scene"):
         from_left = scene["lane"].to_numpy() - 1
@@ -105,6 +109,7 @@ def _read_csv(path: Path) -> pl.DataFrame:
 
 
 def _read_parquet(path: Path) -> pl.DataFrame:
+    """A Parquet file in the schema, with or without a checksum."""
     if not path.is_file():
         raise UserError(
             f"{path}: no such file; give a Parquet file that ganlane prepare wrote, or its folder."
@@ -116,6 +121,7 @@ def _read_parquet(path: Path) -> pl.DataFrame:
         raise UserError(
             f"{path}: not a readable Parquet file (it begins otherwise); prepare it again."
         )
+
     # The checksum is that of the whole file.
     content = path.read_bytes()
     has_checksum(content, path)  # tables of other programs have none
@@ -139,8 +145,11 @@ def open_scenes(
 ) -> Iterator[Scene]:
     """The scenes of recordings of a ``kind``: ``scenes``, ``ngsim`` or ``highd``.
 
-    ``path`` is a file, or a folder where the reader takes one; rows read and dropped are added to
-    ``count``. The other arguments are :func:`ngsim_scenes`'s, and for NGSIM only.
+    Args:
+        kind: what the files are.
+        path: a file, or a folder where the reader takes one.
+        count: rows read and dropped are added to it.
+        parameters, scratch, on_progress: those of :func:`ngsim_scenes`, and for NGSIM only.
 
     Raises:
         UserError: a damaged or missing file, or an unknown kind.

@@ -17,7 +17,9 @@ import polars as pl
 from ganlane.data.tables import FIRST_LINE
 from ganlane.errors import UserError
 
+#: Time between two frames, s.
 FRAME_S = 0.1
+#: Numbers of a car's tracks differ by it.
 TRACK_STRIDE = 10_000
 #: Columns in order, with their types.
 SCHEMA = pl.Schema(
@@ -42,6 +44,7 @@ TRACK = ("scene", "vehicle")
 #: Bounds that no recording of road traffic in SI units exceeds.
 MAX_MEDIAN_SPEED_MPS = 60.0
 MAX_MEDIAN_LENGTH_M = 12.0
+#: Between the speeds recorded and those that positions show, either way.
 MAX_SPEED_RATIO = 1.4
 #: A track that ends so far behind its beginning runs backwards, m.
 BACKWARDS_M = 5.0
@@ -103,9 +106,13 @@ def number_tracks(frame: pl.DataFrame, source: str) -> pl.DataFrame:
             f"{source}: vehicle numbers from {low} to {high}; expected 0 to {TRACK_STRIDE - 1}, "
             "number them anew."
         )
+
     # A new track begins after each missing frame of the same car.
-    gap = (pl.col("frame").diff() != 1) & (pl.col("vehicle").diff() == 0)
-    track = gap.fill_null(False).cast(pl.Int64).cum_sum().over("vehicle")
+    has_gap = pl.col("frame").diff() != 1
+    same_car = pl.col("vehicle").diff() == 0
+    begins = (has_gap & same_car).fill_null(False)
+    # Gaps so far: 0 in a car's first track.
+    track = begins.cast(pl.Int64).cum_sum().over("vehicle")
     return frame.with_columns(vehicle=pl.col("vehicle") + TRACK_STRIDE * track)
 
 
@@ -133,6 +140,7 @@ def validate(
         raise UserError(f"{source}: no column {', '.join(missing)}; expected {', '.join(SCHEMA)}.")
     if frame.is_empty():
         raise UserError(f"{source}: no rows; a recording with at least one vehicle was expected.")
+
     for name, kind in SCHEMA.items():
         try:
             frame = frame.with_columns(pl.col(name).cast(kind))
@@ -141,6 +149,7 @@ def validate(
                 f"{source}, column {name}: {frame[name].dtype} found, {kind} expected."
             ) from error
     frame = frame.select(SCHEMA.names())
+    # The first mistake is raised.
     for row, what in _mistakes(frame):
         line = f"row {row}" if first_line is None else f"line {row + first_line}"
         raise UserError(f"{source}, {line}, {what}.")
@@ -160,6 +169,7 @@ def _mistakes(frame: pl.DataFrame) -> Iterator[tuple[int, str]]:
         """The first row that is ``bad``, if there is one."""
         yield from frame.select(bad.arg_true().first()).to_series().drop_nulls()
 
+    # Column, what is wrong with it, and in which rows.
     bad: list[tuple[str, str, pl.Expr]] = []
     for name, kind in SCHEMA.items():
         if kind == pl.Float64():
@@ -167,20 +177,24 @@ def _mistakes(frame: pl.DataFrame) -> Iterator[tuple[int, str]]:
             bad.append((name, "is not a finite number", ~is_number))
         else:
             bad.append((name, "is missing", pl.col(name).is_null()))
-    bad += [(name, "is not above 0", pl.col(name) <= 0.0) for name in ("length", "width")]
+    for name in ("length", "width"):
+        bad.append((name, "is not above 0", pl.col(name) <= 0.0))
     bad.append(("frame", "comes twice in its track", step == 0))
     bad.append(("frame", "is before its track's last frame; frames must grow", step < 0))
     for column, what, is_bad in bad:
         for row in first(is_bad):
             yield row, f"column {column}: {frame[column][row]} {what}"
+
     # With most rows further apart than a frame, nothing could be measured between them.
-    for row in first((step.median().over("scene") > 1) & (step > 1)):
+    most_apart = step.median().over("scene") > 1
+    for row in first(most_apart & (step > 1)):
         yield (
             row,
             f"column frame: most rows of scene {frame['scene'][row]} come {frame['step'][row]} "
             f"frames after their track's last one; expected {1 / FRAME_S:.0f} frames a second, "
             "numbered one by one: resample the recording",
         )
+
     # Noise moves a standing car back by decimetres; further back a whole track is turned round.
     track_m = (pl.col("x").last() - pl.col("x").first()).over(TRACK)
     for row in first(track_m < -BACKWARDS_M):
@@ -189,20 +203,23 @@ def _mistakes(frame: pl.DataFrame) -> Iterator[tuple[int, str]]:
             "column x: its track runs backwards, against the direction of growing x; turn x and y "
             "of that carriageway round, or leave its tracks out",
         )
-    # Distance per time, from one row to the next of a track.
+
+    # Distance per time, m/s, from one row to the next of a track.
     rates = pl.col("x").diff().over(TRACK) / (step * FRAME_S)
     # Medians, which a few damaged rows do not move.
     speed, length, rate = frame.select(
         pl.col("speed", "length").median(),
         rate=rates.median(),
     ).row(0)
-    for column, median, bound, unit in (
+    bounds = (
         ("speed", speed, MAX_MEDIAN_SPEED_MPS, "m/s; convert to m/s"),
         ("length", length, MAX_MEDIAN_LENGTH_M, "m; convert feet to m"),
-    ):
+    )
+    for column, median, bound, unit in bounds:
         if median > bound:
             row = next(first(pl.col(column) > bound))
             yield row, f"column {column}: the median is {median:.1f}, which cannot be {unit}"
+
     # Standing traffic shows no ratio. Not even rounded positions give another one than about 1.
     moves = rate is not None and max(abs(rate), abs(speed)) >= 1.0
     if moves and not speed / MAX_SPEED_RATIO < rate < speed * MAX_SPEED_RATIO:

@@ -111,7 +111,8 @@ def survival_curve(duration_s: Floats, complete: Flags) -> tuple[np.ndarray, np.
     """
     ends, ending = np.unique(duration_s[complete], return_counts=True)
     # Those that last at least as long.
-    at_risk = len(duration_s) - np.searchsorted(np.sort(duration_s), ends)
+    shorter = np.searchsorted(np.sort(duration_s), ends)
+    at_risk = len(duration_s) - shorter
     return ends, np.cumprod(1.0 - ending / at_risk)
 
 
@@ -119,7 +120,12 @@ def survival_curve(duration_s: Floats, complete: Flags) -> tuple[np.ndarray, np.
 class Exposure(Record):
     """Amount of driving.
 
-    ``cars`` are counted once per scene, ``road_m`` is the road's mean length over the cars.
+    Attributes:
+        scenes, tracks: number of them.
+        cars: counted once per scene.
+        samples: rows, one per vehicle and frame.
+        road_m: the road's mean length over the cars.
+        vehicle_km: distance driven, km.
     """
 
     scenes: int
@@ -137,15 +143,20 @@ def measure_exposure(frame: pl.DataFrame) -> Exposure:
         road=pl.col("x").max() - pl.col("x").min(),
         cars=(pl.col("vehicle") % TRACK_STRIDE).n_unique(),
     )
+    # Weighted by cars, as equation 9 counts them.
+    road_m = np.average(roads["road"].to_numpy(), weights=roads["cars"].to_numpy())
+
     # The length of each track as it was driven, lane changes included.
-    driven = (pl.col(name).diff().over(TRACK) ** 2 for name in ("x", "y"))
+    squares = [pl.col(name).diff().over(TRACK) ** 2 for name in ("x", "y")]
+    distance = pl.sum_horizontal(*squares).sqrt().sum()
+    driven_m = float(frame.select(distance).item())
     return Exposure(
         scenes=roads.height,
         tracks=frame.select(TRACK).n_unique(),
         cars=int(roads["cars"].sum()),
         samples=frame.height,
-        road_m=float(np.average(roads["road"].to_numpy(), weights=roads["cars"].to_numpy())),
-        vehicle_km=float(frame.select(pl.sum_horizontal(*driven).sqrt().sum()).item()) / 1000.0,
+        road_m=float(road_m),
+        vehicle_km=driven_m / 1000.0,
     )
 
 
@@ -156,25 +167,32 @@ def leader_gaps(frame: pl.DataFrame) -> pl.DataFrame:
     (bumper to bumper), m, negative where two bodies overlap along the road.
     """
     # Sorted along the road, the next row of the same lane and frame is the leader.
-    ahead = {
-        name: pl.col(name).shift(-1).over("scene", "frame", "lane")
-        for name in ("x", "length", "speed")
-    }
+    ordered = frame.sort("scene", "frame", "lane", "x")
+    ahead = {}
+    for name in ("x", "length", "speed"):
+        ahead[name] = pl.col(name).shift(-1).over("scene", "frame", "lane")
     # Positions are those of the bodies' centres, so half of both lengths lies between.
     gap = ahead["x"] - pl.col("x") - 0.5 * (ahead["length"] + pl.col("length"))
-    ordered = frame.sort("scene", "frame", "lane", "x")
+    # Null where nobody is ahead.
     return ordered.with_columns(gap=gap, leader_speed=ahead["speed"]).drop_nulls("gap")
 
 
 def quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
-    """Samples of every quantity of a frame in the schema, sorted: ``speed`` and those below.
+    """Samples of every quantity of a frame in the schema, sorted.
 
-    ``acceleration_raw``: differences of the recorded speed between frames, m/s2; mostly noise in
-    raw recordings. ``acceleration_smoothed``: ``(x[t] - 2 x[t - 1 s] + x[t - 2 s]) / (1 s)^2``, the
-    true acceleration weighted by a triangle of two seconds' width, m/s2; none in tracks of less
-    than two seconds. ``gap``: to the leader (:func:`leader_gaps`), m. ``time_headway``:
-    ``gap / speed`` of followers, s: a gap of 0 to 70 m, at least 2 m/s. ``headway``: each
-    follower's median of ``(gap - 2 m) / speed``, s, over at least 1 s; in the order of the tracks.
+    Returns:
+        By name, each of any length:
+
+        - ``speed``: as recorded, m/s.
+        - ``acceleration_raw``: differences of the recorded speed between frames, m/s2; mostly noise
+          in raw recordings.
+        - ``acceleration_smoothed``: ``(x[t] - 2 x[t - 1 s] + x[t - 2 s]) / (1 s)^2``, the true
+          acceleration weighted by a triangle of two seconds' width, m/s2; none in tracks of less
+          than two seconds.
+        - ``gap``: to the leader (:func:`leader_gaps`), m.
+        - ``time_headway``: ``gap / speed`` of followers, s: a gap of 0 to 70 m, at least 2 m/s.
+        - ``headway``: each follower's median of ``(gap - 2 m) / speed``, s, over at least 1 s; in
+          the order of the tracks.
     """
     # Frames in a second.
     lag = round(1.0 / FRAME_S)
@@ -188,11 +206,12 @@ def quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
         return pl.when(same).then(pl.col(column).shift(frames).over(TRACK))
 
     # Second differences over a second, which noise of a frame does not reach.
+    second_difference = pl.col("x") - 2.0 * earlier("x", lag) + earlier("x", 2 * lag)
     accelerations = frame.select(
         raw=(pl.col("speed") - earlier("speed", 1)) / FRAME_S,
-        smoothed=(pl.col("x") - 2.0 * earlier("x", lag) + earlier("x", 2 * lag))
-        / (lag * FRAME_S) ** 2,
+        smoothed=second_difference / (lag * FRAME_S) ** 2,
     )
+
     # Sorting needs most memory: only once, and with no more columns than needed.
     columns = frame.select(*TRACK, "frame", "x", "speed", "lane", "length")
     with_leader = leader_gaps(columns).select(*TRACK, "speed", "gap")
@@ -202,11 +221,12 @@ def quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
     headway = (pl.col("gap") - _STANDSTILL_GAP_M) / pl.col("speed")
     # One number per driver: a long track counts no more than a short one.
     per_follower = following.group_by(TRACK).agg(headway.median().alias("headway"), pl.len())
+    long_enough = per_follower.filter(pl.col("len") >= lag).sort(TRACK)
     return {
         "speed": frame["speed"].to_numpy(),
         "acceleration_raw": accelerations["raw"].drop_nulls().to_numpy(),
         "acceleration_smoothed": accelerations["smoothed"].drop_nulls().to_numpy(),
-        "headway": per_follower.filter(pl.col("len") >= lag).sort(TRACK)["headway"].to_numpy(),
+        "headway": long_enough["headway"].to_numpy(),
         "time_headway": (following["gap"] / following["speed"]).to_numpy(),
         "gap": with_leader["gap"].to_numpy(),
     }
@@ -217,7 +237,8 @@ def poisson_interval(count: int) -> tuple[float, float]:
     tail = 0.5 * (1.0 - 0.95)
     # Quantiles of gamma distributions; after no event the lower bound is 0.
     low = gammaincinv(count, tail) if count else 0.0
-    return float(low), float(gammaincinv(count + 1, 1.0 - tail))
+    high = gammaincinv(count + 1, 1.0 - tail)
+    return float(low), float(high)
 
 
 @dataclass(frozen=True)
@@ -257,11 +278,11 @@ def lane_change_statistics(
     speed: Floats,
 ) -> LaneChangeStatistics:
     """Statistics of lane changes found in that much driving at the speeds [R], m/s."""
-    # Two rates: per car and km of road, and per km driven.
     n = len(changes)
     km = exposure.vehicle_km
     low, high = poisson_interval(n)
     speed_mps = float(speed.mean())
+    # Two rates: per car and km of road (equation 9), and per km driven.
     by_road = n / exposure.cars * 1000.0 / exposure.road_m
     by_distance = n / km
     return LaneChangeStatistics(
@@ -322,17 +343,23 @@ def driving_statistics(frame: pl.DataFrame) -> DrivingStatistics:
     exposure = measure_exposure(frame)
     samples = quantities(frame)
     changes = find_lane_changes(tracks_of_frame(frame))
-    described = ("speed", "acceleration_raw", "acceleration_smoothed", "headway")
     return DrivingStatistics(
         exposure=exposure,
         lane_changes=lane_change_statistics(changes, exposure, samples["speed"]),
+        speed=describe(samples["speed"]),
         speed_sd_in_frame=_mean_spread(frame, ["scene", "frame"]),
         speed_sd_in_lane=_mean_spread(frame, ["scene", "frame", "lane"]),
-        **{name: describe(samples[name]) for name in described},
+        acceleration_raw=describe(samples["acceleration_raw"]),
+        acceleration_smoothed=describe(samples["acceleration_smoothed"]),
+        headway=describe(samples["headway"]),
     )
 
 
 def _mean_spread(frame: pl.DataFrame, groups: list[str]) -> float | None:
+    """Mean of the standard deviations of the speeds within groups of rows, m/s; None without any.
+
+    ``groups`` are the columns that a group has in common.
+    """
     # In the order of the rows, so that the mean is the same to the last bit in every run.
     spreads = frame.group_by(groups, maintain_order=True).agg(pl.col("speed").std())
     # One vehicle has no deviation; the mean of nothing is None.

@@ -19,6 +19,7 @@ LINE = "line"
 FIRST_LINE = 2
 #: ``1,118,846,980,200``: commas that separate thousands, unlike a decimal comma.
 _THOUSANDS = r"^[+-]?\d{1,3}(,\d{3})+(\.\d*)?$"
+#: Type of a column.
 Kind = pl.DataType | type[pl.DataType]
 #: Called with the bytes done so far and the total, None where the total is unknown.
 OnProgress = Callable[[int, int | None], None]
@@ -26,9 +27,12 @@ OnProgress = Callable[[int, int | None], None]
 
 @dataclass(frozen=True)
 class TextTable:
-    """Layout of a text table; ``names`` are those of its columns, in lower case.
+    """Layout of a text table.
 
-    With ``blanks``, runs of blanks separate the columns, not commas, and there is no header.
+    Attributes:
+        path: the file.
+        names: those of its columns, in lower case.
+        blanks: runs of blanks separate the columns, not commas, and there is no header.
     """
 
     path: Path
@@ -52,7 +56,11 @@ def read_table(path: str | Path, columns: Mapping[str, Kind]) -> pl.DataFrame:
 
 
 def csv_table(path: Path, wanted: Iterable[str]) -> TextTable:
-    """Layout of a CSV file from its header, which must hold the ``wanted`` columns in any case."""
+    """Layout of a CSV file from its header, which must hold the ``wanted`` columns in any case.
+
+    Raises:
+        UserError: no such file, no text table, or a missing column.
+    """
     # Names in any case, with blanks around them.
     header = _fields(first_line(path), f"{path}, line 1")
     names = tuple(name.strip().lower() for name in header)
@@ -66,7 +74,11 @@ def csv_table(path: Path, wanted: Iterable[str]) -> TextTable:
 
 
 def first_line(path: Path) -> str:
-    """The first line of a text file, without a byte order mark."""
+    """The first line of a text file, without a byte order mark.
+
+    Raises:
+        UserError: no such file, or an empty one, or no text.
+    """
     if not path.is_file():
         raise UserError(f"{path}: no such file; give the path of a text table.")
     with path.open("rb") as file:
@@ -85,7 +97,9 @@ def first_line(path: Path) -> str:
 
 def reason(error: Exception) -> str:
     """The first line of a library's error message, to be quoted inside one of ours."""
-    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(". ")
+    # An error without a message says by its type what it is.
+    lines = str(error).splitlines() or [type(error).__name__]
+    return lines[0].rstrip(". ")
 
 
 def converted(text: pl.DataFrame, columns: Mapping[str, Kind], path: Path) -> pl.DataFrame:
@@ -109,9 +123,11 @@ def convert(text: pl.DataFrame, column: str, kind: Kind, path: Path) -> pl.Serie
     refuse(field.is_null() | (field == ""), what="is empty; the row is incomplete")
     if kind == pl.String:
         return field
+
     # Any other comma stays, so that the field is reported as no number.
+    has_thousands = field.str.contains(_THOUSANDS)
     without = field.str.replace_all(",", "", literal=True)
-    field = without.zip_with(field.str.contains(_THOUSANDS), field)
+    field = without.zip_with(has_thousands, field)
     # Through floats, since whole numbers may be written as 3.0.
     numbers = field.cast(pl.Float64, strict=False)
     refuse(numbers.is_null(), what="is not a number")
@@ -129,13 +145,23 @@ def raise_where(
     path: Path,
     what: str,
 ) -> None:
-    """Raise a UserError that names the first of the ``rows`` that is ``bad``; null is not bad."""
-    if bad.any():
-        row = rows.row(bad.fill_null(False).arg_max(), named=True)  # type: ignore[arg-type]
-        field = "the field" if row[column] in (None, "") else repr(row[column])
-        raise UserError(
-            f"{path}, line {row[LINE]}, column {column}: {field} {what}; correct or remove the row."
-        )
+    """Raise a UserError that names the first of the ``rows`` that is ``bad``.
+
+    Args:
+        bad: flags [R] of the rows; null is not bad.
+        rows: of the file ``path``, with :data:`LINE`.
+        column: the one to name.
+        path: the file.
+        what: what is wrong with its field, as "is not a number".
+    """
+    if not bad.any():
+        return
+    first = bad.fill_null(False).arg_max()
+    row = rows.row(first, named=True)  # type: ignore[arg-type]
+    field = "the field" if row[column] in (None, "") else repr(row[column])
+    raise UserError(
+        f"{path}, line {row[LINE]}, column {column}: {field} {what}; correct or remove the row."
+    )
 
 
 def raise_unless_positive(rows: pl.DataFrame, columns: Sequence[str], path: Path) -> None:
@@ -152,6 +178,12 @@ def read_blocks(
 ) -> Iterator[pl.DataFrame]:
     """The ``wanted`` columns as text, and ``line``, block by block in the order of the file.
 
+    Args:
+        table: layout of the file.
+        wanted: names of columns.
+        block_bytes: about so many bytes of the file are in memory at a time.
+        on_progress: called after each block.
+
     Raises:
         UserError: a row that does not fit, is not text, empty or cut off; the message names file
             and line.
@@ -160,9 +192,11 @@ def read_blocks(
     done = 0
     total = table.path.stat().st_size
     for block in _whole_lines(table, block_bytes):
+        # The last line of the file may have no line break.
         rows = block.count(b"\n") + (not block.endswith(b"\n"))
         lines = pl.int_range(number, number + rows, dtype=pl.Int64).alias(LINE)
         yield _parse(table, block, number, rows, wanted).with_columns(lines)
+
         number += rows
         done += len(block)
         if on_progress is not None:
@@ -175,6 +209,7 @@ def _whole_lines(table: TextTable, block_bytes: int) -> Iterator[bytes]:
     Empty lines at the end are left out.
     """
     with table.path.open("rb") as file:
+        # The header.
         if not table.blanks:
             file.readline()
         rest = b""
@@ -191,10 +226,13 @@ def _whole_lines(table: TextTable, block_bytes: int) -> Iterator[bytes]:
 
 
 def _fields(line: str, place: str, blanks: bool = False) -> list[str]:
-    """The fields of one line."""
+    """The fields of one line, which stands at ``place`` (file and number)."""
+    if blanks:
+        return line.split()
     try:
-        return line.split() if blanks else next(csv.reader([line]), [])
+        return next(csv.reader([line]), [])
     except csv.Error as error:
+        # What follows the dash is for programmers.
         what = reason(error).partition(" - ")[0]
         raise UserError(f"{place}: not a line of CSV ({what}); correct or remove it.") from error
 
@@ -209,12 +247,14 @@ def _parse(
     """The ``wanted`` columns of a block of ``rows`` lines, the first of which is ``number``."""
     separator = " " if table.blanks else ","
     if table.blanks:
+        # A single blank between two fields, which is all that the parser knows.
         block = b"\n".join(b" ".join(line.split()) for line in block.split(b"\n"))
     # The parser fills short rows with nulls, so they are found by counting separators.
     # Quoted fields may hold separators, so the count says nothing there.
     expected = rows * (len(table.names) - 1)
     if b'"' not in block and block.count(separator.encode()) != expected:
         _check_lines(table, block, number)
+
     # Columns are named by their position, since a file may use a name twice.
     places = [f"column_{index}" for index in range(len(table.names))]
     try:
@@ -233,13 +273,23 @@ def _parse(
     if frame.height != rows:
         _check_lines(table, block, number)
         raise UserError(f"{table.path}, from line {number}: a row stretches over several lines.")
-    return frame.select(pl.col(places[table.names.index(name)]).alias(name) for name in wanted)
+
+    columns = []
+    for name in wanted:
+        # The first of several columns of one name.
+        place = places[table.names.index(name)]
+        columns.append(pl.col(place).alias(name))
+    return frame.select(columns)
 
 
 def _check_lines(table: TextTable, block: bytes, number: int) -> None:
-    """Raise a UserError that names the first line of a block that does not fit the table."""
+    """Raise a UserError that names the first line of a block that does not fit the table.
+
+    Nothing happens where all lines fit.
+    """
     expected = len(table.names)
-    for line, raw in enumerate(block.removesuffix(b"\n").split(b"\n"), number):
+    lines = block.removesuffix(b"\n").split(b"\n")
+    for line, raw in enumerate(lines, number):
         place = f"{table.path}, line {line}"
         if not raw.strip():
             raise UserError(f"{place}: the line is empty; remove it.")
@@ -249,6 +299,7 @@ def _check_lines(table: TextTable, block: bytes, number: int) -> None:
             raise UserError(
                 f"{place}: the line is not text; copy or download the file again."
             ) from error
+
         fields = len(_fields(text, place, table.blanks))
         if raw.count(b'"') % 2:
             raise UserError(

@@ -5,6 +5,7 @@ Colours, letters, metres to pixels, and the road, which does not move.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -15,6 +16,7 @@ from PIL.ImageColor import getrgb
 from ganlane.settings.render import FilmConfig
 from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
 
+# Colours, as Pillow reads them.
 HEADER = "#16181c"
 VERGE = "#2a332e"
 VERGE_STRIPE = "#2e3832"
@@ -27,11 +29,19 @@ CRASH = "#ff3e3e"
 GOOD = "#68d47e"
 AMBER = "#ffd640"
 BRAKE = "#ff3028"
-#: Blue for the other vehicles, from standing to ``FAST_MPS``, in so many levels.
-_BLUES = (38, 52, 128), (58, 122, 224), (158, 226, 255)
-FAST_MPS, _LEVELS = 35.0, 36
+#: Blue for the other vehicles, from standing to ``FAST_MPS``: red, green and blue of each.
+_BLUES = (
+    (38, 52, 128),
+    (58, 122, 224),
+    (158, 226, 255),
+)
+FAST_MPS = 35.0
+#: Number of its levels.
+_LEVELS = 36
 
-HEADER_HEIGHT, FOOTER_HEIGHT = 56, 24
+#: Rows above and below the picture of the road, pixels.
+HEADER_HEIGHT = 56
+FOOTER_HEIGHT = 24
 #: Height of the small letters, pixels.
 SMALL = 12
 #: Share of the road in the picture that lies behind the ego.
@@ -40,7 +50,9 @@ BEHIND = 0.38
 #: look wider than they are, overlaps stay overlaps.
 EXAGGERATION = 1.5
 #: Lane marks: 6 m and a gap of 12 m, as on motorways.
-PERIOD_M, DASH_M = 18.0, 6.0
+PERIOD_M = 18.0
+DASH_M = 6.0
+#: Posts beside the road with their distance from its start.
 POST_EVERY_M = 50.0
 
 
@@ -51,12 +63,17 @@ def speed_tint(speed_mps: float) -> str:
     place = 2.0 * round(share * _LEVELS) / _LEVELS
     # Red, green and blue, between the blues on both sides.
     channels = [np.interp(place, (0.0, 1.0, 2.0), channel) for channel in zip(*_BLUES)]
-    return f"#{bytes(map(round, channels)).hex()}"
+    return _hex_colour(channels)
 
 
 def darker(colour: str) -> str:
     """A colour at about a third of its brightness."""
-    return f"#{bytes(round(0.35 * channel) for channel in getrgb(colour)).hex()}"
+    return _hex_colour([0.35 * channel for channel in getrgb(colour)])
+
+
+def _hex_colour(channels: Sequence[float]) -> str:
+    """Red, green and blue, each from 0 to 255, as ``#rrggbb``."""
+    return f"#{bytes(map(round, channels)).hex()}"
 
 
 def readable_on(colour: str) -> str:
@@ -74,7 +91,10 @@ def text_mask(text: str, size: int) -> Image.Image:
     # Pillow's own letters: no font has to be installed.
     letters = ImageFont.load_default(size)
     left, _, right, _ = letters.getbbox(text)
-    mask = Image.new("L", (max(1, round(right - left) + 1), round(size * 1.25)))
+    # At least one pixel: an empty text has a mask too.
+    width = max(1, round(right - left) + 1)
+    height = round(size * 1.25)
+    mask = Image.new("L", (width, height))
     ImageDraw.Draw(mask).text((-left, 0), text, fill=255, font=letters)
     return mask
 
@@ -87,20 +107,34 @@ def put_text(
     size: int = SMALL,
     anchor: float = 0.0,
 ) -> None:
-    """Write ``text`` with its top at ``position``.
+    """Write a text onto ``image``.
 
-    ``anchor`` 0 starts there, 0.5 centres, 1 ends there.
+    Args:
+        image: the picture that is changed.
+        position: column, and row of the text's top, pixels.
+        text: what is written.
+        colour: of the letters.
+        size: of the letters, pixels.
+        anchor: 0: the text starts at the column, 0.5: it is centred there, 1: it ends there.
     """
     mask = text_mask(text, size)
-    place = round(position[0] - anchor * mask.width), round(position[1])
+    column, row = position
+    place = (round(column - anchor * mask.width), round(row))
     image.paste(colour, place, mask)
 
 
 class Window:
     """The scale of a picture for a road of ``lanes`` lanes; rows of the picture count downwards.
 
+    Args:
+        look: size of the picture, pixels, and length of the road in it, m.
+        lanes: number of lanes.
+        lane_width_m: width of a lane, m.
+
     Attributes:
         width, height: of the picture, pixels.
+        length_m: of the road in the picture.
+        lanes, lane_width_m: as given.
         along, across: pixels per metre along and across the road. Across it they are exaggerated,
             but never more than the picture has room for.
         edges: rows of the left (upper) and right (lower) edge of the road.
@@ -120,16 +154,21 @@ class Window:
         self.along = look.width / look.road_m
         # The road may not be higher than what header and footer leave, with 1 m of verge at each
         # side.
-        self.across = min(self.along * EXAGGERATION, room / (lanes * lane_width_m + 2.0))
+        most_across = room / (lanes * lane_width_m + 2.0)
+        self.across = min(self.along * EXAGGERATION, most_across)
 
         # The centre of lane 0, the rightmost, is at y = 0.
-        upper, lower = self.row([(lanes - 0.5) * lane_width_m, -0.5 * lane_width_m])
-        self.edges = float(upper), float(lower)
+        left_edge_m = (lanes - 0.5) * lane_width_m
+        right_edge_m = -0.5 * lane_width_m
+        upper, lower = self.row([left_edge_m, right_edge_m])
+        self.edges = (float(upper), float(lower))
 
     def row(self, y_m: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Picture rows of lateral positions, m."""
-        centre = 0.5 * (self.lanes - 1) * self.lane_width_m
-        return self._middle - (np.asarray(y_m, dtype=np.float64) - centre) * self.across
+        # The middle of the road is in the middle between header and footer.
+        middle_m = 0.5 * (self.lanes - 1) * self.lane_width_m
+        left_of_middle_m = np.asarray(y_m, dtype=np.float64) - middle_m
+        return self._middle - left_of_middle_m * self.across
 
     def start(self, ego_x_m: float) -> float:
         """Where the picture begins, m along the road, with the ego at ``ego_x_m``."""
@@ -137,22 +176,32 @@ class Window:
 
     def column(self, x_m: npt.ArrayLike, ego_x_m: float) -> npt.NDArray[np.float64]:
         """Picture columns of positions along the road, m, with the ego at ``ego_x_m``."""
-        return (np.asarray(x_m, dtype=np.float64) - self.start(ego_x_m)) * self.along
+        from_start_m = np.asarray(x_m, dtype=np.float64) - self.start(ego_x_m)
+        return from_start_m * self.along
 
 
 class Backdrop:
     """Verges, asphalt, edge lines and dashed lane marks.
 
     Drawn once, one period wider than the picture. Where lanes begin and end is drawn on top.
+
+    Args:
+        window: scale of the picture.
+        stretches: where each lane begins and ends, from the rightmost; empty: all go on for ever.
+
+    Attributes:
+        period: pixels after which the road looks the same.
+        strip: the road without posts and ends of lanes.
     """
 
     def __init__(self, window: Window, stretches: Stretches = ()):
         self.window = window
         self.stretches = stretches
+
         # Two periods of lane marks, after which the verge's stripes repeat, too.
         self.period = round(2 * PERIOD_M * window.along)
-        size = (window.width + self.period, window.height)
-        self.strip = strip = Image.new("RGB", size, VERGE)
+        strip = Image.new("RGB", (window.width + self.period, window.height), VERGE)
+        self.strip = strip
         draw = ImageDraw.Draw(strip)
 
         # Columns where periods of lane marks begin.
@@ -170,9 +219,10 @@ class Backdrop:
 
         # Dashes between the lanes.
         borders_m = (np.arange(window.lanes - 1) + 0.5) * window.lane_width_m
+        dash = DASH_M * window.along
         for row in window.row(borders_m):
             for start in starts:
-                draw.line((start, row, start + DASH_M * window.along, row), fill=MARK, width=2)
+                draw.line((start, row, start + dash, row), fill=MARK, width=2)
 
     def at(self, ego_x_m: float) -> Image.Image:
         """A fresh picture of the road around the ego.
@@ -181,18 +231,20 @@ class Backdrop:
         """
         window = self.window
         # The strip repeats after a period, so the picture is cut out of it anywhere on the road.
-        shift = round(-float(window.column(0.0, ego_x_m))) % self.period
+        origin = float(window.column(0.0, ego_x_m))
+        shift = round(-origin) % self.period
         picture = self.strip.crop((shift, 0, shift + window.width, window.height))
         draw = ImageDraw.Draw(picture)
         for lane, stretch in enumerate(self.stretches):
             self._draw_ends(draw, lane, stretch, ego_x_m)
 
         # 10 m more at both ends, where a post's number may still reach into the picture.
-        start = window.start(ego_x_m)
-        first = np.ceil((start - 10.0) / POST_EVERY_M) * POST_EVERY_M
-        posts = np.arange(first, start + window.length_m + 10.0, POST_EVERY_M)
+        start_m = window.start(ego_x_m)
+        first_m = np.ceil((start_m - 10.0) / POST_EVERY_M) * POST_EVERY_M
+        end_m = start_m + window.length_m + 10.0
+        posts_m = np.arange(first_m, end_m, POST_EVERY_M)
         _, lower = window.edges
-        for metres, column in zip(posts, window.column(posts, ego_x_m)):
+        for metres, column in zip(posts_m, window.column(posts_m, ego_x_m)):
             draw.line((column, lower + 7, column, lower + 20), fill=FAINT, width=2)
             put_text(picture, (column + 7, lower + 8), f"{int(metres)} m")
         return picture
@@ -206,10 +258,11 @@ class Backdrop:
         """
         window = self.window
         is_leftmost = lane == window.lanes - 1
-        far_m = window.length_m * 2.0
         # Within the picture's surroundings, since pixels of a lane without an end would overflow.
-        ends = np.clip([stretch.begin_m, stretch.end_m], ego_x_m - far_m, ego_x_m + far_m)
-        begin, end = window.column(ends, ego_x_m).tolist()
+        far_m = window.length_m * 2.0
+        ends_m = [stretch.begin_m, stretch.end_m]
+        near_ends_m = np.clip(ends_m, ego_x_m - far_m, ego_x_m + far_m)
+        begin, end = window.column(near_ends_m, ego_x_m).tolist()
 
         # Rows of the lane's left and right side.
         sides = (np.array([0.5, -0.5]) + lane) * window.lane_width_m
@@ -218,10 +271,15 @@ class Backdrop:
         top = upper - 6 if is_leftmost else upper + 2
         bottom = lower + 6 if lane == 0 else lower - 2
 
-        # Columns before and behind the lane: there is no road at one, and a ramp at the other.
+        # Columns before and behind the lane: there is no road at one, and a ramp at the other. An
+        # exit lane goes on as a ramp, any other begins as one.
         before = (0.0, begin)
         behind = (end, float(window.width))
-        nothing, ramp = (before, behind) if stretch.end == EXIT else (behind, before)
+        if stretch.end == EXIT:
+            nothing, ramp = before, behind
+        else:
+            nothing, ramp = behind, before
+
         left, right = nothing
         if left < right:
             draw.rectangle((left, top, right, bottom), fill=VERGE)
@@ -229,7 +287,7 @@ class Backdrop:
         if stretch.end == WALL:
             draw.rectangle((end, top, end + window.along, bottom), fill=CRASH)
 
-        # Kerbs between the ramp and the lanes beside it.
+        # Kerbs between the ramp and the lanes beside it, unless it lies outside the picture.
         left, right = ramp
         if left >= right:
             return

@@ -21,8 +21,8 @@ from ganlane.view.figures import STYLE, FloatArray, add_legend, palette, panel_g
 
 #: Number of decisions so far: the horizontal axis of every learning curve.
 X_COLUMN = "decisions"
-#: Title and unit of the columns that are drawn. The agent maximises the discounted return, of which
-#: mean Q is its own estimate.
+#: Title and unit of the columns that are drawn, in the order of the panels. The agent maximises the
+#: discounted return, of which mean Q is its own estimate.
 PANELS = {
     "mean_return": ("mean return", "reward per episode"),
     "crash_rate": ("crash rate", "share of episodes"),
@@ -42,8 +42,9 @@ def read_metrics(path: str | Path) -> pl.DataFrame:
         UserError: no such file, it cannot be read, it holds text, or it has no column ``decisions``
             or no rows.
     """
-    path = Path(path)
-    file = path / "metrics.csv" if path.is_dir() else path
+    file = Path(path)
+    if file.is_dir():
+        file = file / "metrics.csv"
     try:
         # Types are inferred from all rows: a column may be empty for the first thousands.
         frame = pl.read_csv(file, infer_schema_length=None)
@@ -51,6 +52,7 @@ def read_metrics(path: str | Path) -> pl.DataFrame:
         if numbers.is_empty():
             raise ValueError("it has no rows")
     except (PolarsError, OSError, ValueError) as error:
+        # The messages of polars have several lines.
         reason = str(error).splitlines()[0]
         raise UserError(
             f"{file}: no metrics of a training run ({reason:.200}); give a run's folder or its "
@@ -70,7 +72,8 @@ def read_run(path: str | Path) -> pl.DataFrame:
         UserError: see :func:`read_metrics`.
     """
     path = Path(path)
-    metrics, evaluation = read_metrics(path), path / "evaluation.csv"
+    metrics = read_metrics(path)
+    evaluation = path / "evaluation.csv"
     if not evaluation.is_file():
         return metrics
     columns = pl.exclude(X_COLUMN).name.prefix("evaluation_")
@@ -88,15 +91,18 @@ def read_runs(paths: Sequence[str | Path]) -> dict[str, list[pl.DataFrame]]:
     Raises:
         UserError: a folder comes twice, or cannot be read.
     """
+    # Files of metrics, or folders that hold one.
     files: list[Path] = []
-    for path in map(Path, paths):
+    for path in paths:
+        place = Path(path).resolve()
         # A folder without runs is refused when it is read.
-        files += runs_below(path.resolve(), "metrics.csv") or [path.resolve()]
+        files += runs_below(place, "metrics.csv") or [place]
     # Twice the same run would be drawn as two seeds that agree perfectly.
     if len(set(files)) < len(files):
         raise UserError(
             f"run={','.join(map(str, paths))}: a folder comes twice; give each run once."
         )
+
     folders = [file.parent if file.suffix == ".csv" else file for file in files]
     runs: dict[str, list[pl.DataFrame]] = {}
     for name, file in zip(names_of_runs(folders), files):
@@ -110,30 +116,39 @@ def read_runs(paths: Sequence[str | Path]) -> dict[str, list[pl.DataFrame]]:
 def draw_runs(runs: Mapping[str, Sequence[pl.DataFrame]]) -> Figure:
     """Training runs over the number of decisions, one colour per name.
 
-    ``runs`` holds by name the metrics (:func:`read_run`) of one run, or of the same with several
-    seeds, whose mean is drawn in a band from the lowest to the highest. There is a panel for those
-    of :data:`PANELS` that any run has numbers for.
+    Args:
+        runs: by name the metrics (:func:`read_run`) of one run, or of the same with several seeds,
+            whose mean is drawn in a band from the lowest to the highest.
+
+    Returns:
+        A figure with a panel for those of :data:`PANELS` that any run has numbers for.
 
     Raises:
         UserError: there is nothing to draw.
     """
-    lines = {
-        column: {name: _lines(frames, column) for name, frames in runs.items()} for column in PANELS
-    }
-    drawn = [column for column in PANELS if any(lines[column].values())]
-    if not drawn:
+    # By column, of every name.
+    lines = {}
+    for column in PANELS:
+        of_column = {name: _lines(frames, column) for name, frames in runs.items()}
+        # Without numbers there is no panel.
+        if any(of_column.values()):
+            lines[column] = of_column
+    if not lines:
         raise UserError(
             f"run={','.join(runs)}: no numbers in any of {', '.join(PANELS)}; give the folder of a "
             "training run."
         )
-    figure, grid = panel_grid(len(drawn))
+
+    figure, grid = panel_grid(len(lines))
     colours = palette(list(runs))
-    for axes, column in zip(grid, drawn):
+    for axes, (column, of_column) in zip(grid, lines.items()):
         title, unit = PANELS[column]
         axes.set(title=title, ylabel=unit, xlabel=X_COLUMN)
+        # 100 k rather than 100000.
         axes.xaxis.set_major_formatter(EngFormatter())
-        for name, of_run in lines[column].items():
+        for name, of_run in of_column.items():
             plot_middle(axes, of_run, color=colours[name])
+
     legend = {}
     for name, frames in runs.items():
         count = f" ({len(frames)} seeds: mean, range)" if len(frames) > 1 else ""
@@ -146,10 +161,12 @@ def _lines(frames: Sequence[pl.DataFrame], column: str) -> list[tuple[FloatArray
     """Decisions and values of a column, of every run that has it."""
     lines = []
     for frame in frames:
-        if column in frame.columns:
-            table = frame.select(X_COLUMN, column).drop_nulls()
-            if table.height:
-                lines.append((table[X_COLUMN].to_numpy(), table[column].to_numpy()))
+        if column not in frame.columns:
+            continue
+        # Null where the run has not logged it.
+        table = frame.select(X_COLUMN, column).drop_nulls()
+        if table.height:
+            lines.append((table[X_COLUMN].to_numpy(), table[column].to_numpy()))
     return lines
 
 
@@ -159,15 +176,24 @@ def plot_middle(
     middle: Callable[..., FloatArray] = np.mean,
     **style: Any,
 ) -> None:
-    """One line as it is; of several, the ``middle`` and the range where all have values."""
+    """Draw the curve of one run as it is; of several, their middle and their range.
+
+    Args:
+        axes: the panel.
+        lines: places and values, [T] each, of every run; there may be none.
+        middle: of the runs' values, mean or median.
+        **style: of the line, as for matplotlib.
+    """
     if len(lines) == 1:
         plot_line(axes, *lines[0], **style)
     if len(lines) < 2:
         return
+
     # Seeds are logged at different decisions: values in between are interpolated.
     x = np.unique(np.concatenate([x for x, _ in lines]))
     # Only where all have values, else the middle would jump where a run begins or ends.
-    first, last = max(x[0] for x, _ in lines), min(x[-1] for x, _ in lines)
+    first = max(x[0] for x, _ in lines)
+    last = min(x[-1] for x, _ in lines)
     shared = x[(x >= first) & (x <= last)]
     values = np.stack([np.interp(shared, *line) for line in lines])
     plot_line(axes, shared, middle(values, axis=0), **style)

@@ -25,10 +25,20 @@ logging.getLogger("fontTools").setLevel(logging.WARNING)
 
 FloatArray = npt.NDArray[np.float64]
 
-INK, FAINT, GRID = "#262a30", "#6e747c", "#e2e5e9"
+INK = "#262a30"
+FAINT = "#6e747c"
+GRID = "#e2e5e9"
 #: Okabe and Ito's palette, which colour-blind readers tell apart, with grey for its yellow (too
 #: pale on white).
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f7f7f")
+COLOURS = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#56b4e9",
+    "#e69f00",
+    "#7f7f7f",
+)
 #: Matplotlib's rc parameters for all figures (their type differs between its versions).
 STYLE: Any = {
     "axes.axisbelow": True,
@@ -93,6 +103,7 @@ def panel_grid(count: int) -> tuple[Figure, list[Axes]]:
     across = min(3, count)
     # -(-a // b) is a / b rounded up.
     down = -(-count // across)
+    # Width and height in inches.
     figure = Figure(figsize=(across * 4.0, down * 2.3 + 0.3))
     grid = figure.subplots(down, across, squeeze=False).ravel()
     for unused in grid[count:]:
@@ -101,15 +112,20 @@ def panel_grid(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def add_legend(figure: Figure, colours: Mapping[str, str], others: Sequence[Line2D] = ()) -> None:
-    """Names in their colours along the top, in several rows if needed."""
-    handles = [
-        *(Line2D([], [], color=colour, label=name, lw=2) for name, colour in colours.items()),
-        *others,
-    ]
-    # about, at this size of letters
+    """Names in their colours along the top, in several rows if needed.
+
+    Args:
+        figure: where the legend is put.
+        colours: of the lines, by their names.
+        others: further entries, at the end.
+    """
+    handles = [Line2D([], [], color=colours[name], label=name, lw=2) for name in colours]
+    handles += others
+    # Inches, about, at this size of letters.
     widths_in = [0.65 + 0.08 * len(str(handle.get_label())) for handle in handles]
+    # As many columns as fit into the figure's width; names run down the columns.
     for columns in range(len(handles), 0, -1):
-        parts = np.array_split(widths_in, columns)  # names run down the columns
+        parts = np.array_split(widths_in, columns)
         if sum(part.max() for part in parts) <= figure.get_figwidth():
             break
     figure.legend(handles=handles, loc="outside upper left", ncols=columns)

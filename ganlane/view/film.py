@@ -21,21 +21,27 @@ from ganlane.view.record import Trajectory
 STRIP_FRAMES = 4
 #: How long the last frame stays, s of film.
 HOLD_S = 1.5
-#: H.264 takes even sides only.
+#: What ffmpeg makes of the pictures. H.264 takes even sides only.
 _H264 = (
     "-an -vf crop=trunc(iw/2)*2:trunc(ih/2)*2 -c:v libx264 -pix_fmt yuv420p -crf 20 "
     "-preset medium -movflags +faststart -f mp4"
 )
-#: A GIF's colours, and the frames that they are taken from.
-_COLOURS, _PALETTE_FRAMES = 128, 8
+#: Number of colours of a GIF.
+_COLOURS = 128
+#: Number of frames that they are taken from.
+_PALETTE_FRAMES = 8
 
 
 def film_frames(trajectory: Trajectory, look: FilmConfig) -> list[int]:
     """Frames of the trajectory, in the order in which a film shows them.
 
+    The film is ``look.speedup`` times as fast as the episode; its last frame stays for
+    :data:`HOLD_S`.
+
     Raises:
         UserError: the film begins after the episode's end.
     """
+    # Refused here where the episode is over by then.
     trajectory.since(look.start_s)
     time = trajectory.time_s
     end = min(look.end_s or np.inf, float(time[-1]))
@@ -44,7 +50,8 @@ def film_frames(trajectory: Trajectory, look: FilmConfig) -> list[int]:
     # At every time of the film the last recorded frame is shown.
     shown = np.searchsorted(time, [*times + 1e-9, end + 1e-9], side="right") - 1
     *frames, last = shown.tolist()
-    return frames + [last] * max(1, round(HOLD_S * look.fps))
+    hold = max(1, round(HOLD_S * look.fps))
+    return frames + [last] * hold
 
 
 def write_film(trajectory: Trajectory, path: str | Path, look: FilmConfig | None = None) -> Path:
@@ -64,15 +71,19 @@ def write_film(trajectory: Trajectory, path: str | Path, look: FilmConfig | None
     path = Path(path)
     kind = path.suffix.removeprefix(".").lower()
     look = look or FilmConfig()
-    painter, frames = FramePainter(trajectory, look), film_frames(trajectory, look)
+    painter = FramePainter(trajectory, look)
+    frames = film_frames(trajectory, look)
+
     if kind == "gif":
         write_bytes(path, _gif(painter, frames))
     elif kind == "mp4":
         _write_mp4(painter, frames, path)
     elif kind == "png":
+        # One below the other.
         rows = [painter.draw(frame) for frame in spread(frames, STRIP_FRAMES)]
+        strip = Image.fromarray(np.concatenate(rows))
         with atomic_path(path) as part:
-            Image.fromarray(np.concatenate(rows)).save(part, format="PNG", optimize=True)
+            strip.save(part, format="PNG", optimize=True)
     else:
         raise UserError(f"{path}: a film ends in .mp4, .gif or .png; choose one of them.")
     return path
@@ -80,7 +91,8 @@ def write_film(trajectory: Trajectory, path: str | Path, look: FilmConfig | None
 
 def spread(frames: Sequence[int], count: int) -> list[int]:
     """At most ``count`` of the frames, evenly from the first to the last."""
-    places = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
+    count = min(count, len(frames))
+    places = np.linspace(0, len(frames) - 1, count).round().astype(int)
     return [frames[place] for place in places]
 
 
@@ -89,13 +101,17 @@ def _gif(painter: FramePainter, frames: Sequence[int]) -> bytes:
     # The commonest colours would leave out small bright things, such as lights.
     some = np.concatenate([painter.draw(frame) for frame in spread(frames, _PALETTE_FRAMES)])
     palette = Image.fromarray(some).quantize(_COLOURS, method=Image.Quantize.MAXCOVERAGE)
-    pictures = [
-        Image.fromarray(painter.draw(frame)).quantize(palette=palette, dither=Image.Dither.NONE)
-        for frame in frames
-    ]
+    pictures = []
+    for frame in frames:
+        picture = Image.fromarray(painter.draw(frame))
+        # Without dither, which would make still things shimmer.
+        pictures.append(picture.quantize(palette=palette, dither=Image.Dither.NONE))
+
     # Whole hundredths of a second that add up to the film's length.
     ends = np.rint(np.arange(len(pictures) + 1) * 100.0 / painter.look.fps).astype(int)
+    # Two hundredths at least: players slow down what is faster.
     durations_ms = (np.diff(ends).clip(min=2) * 10).tolist()
+
     file = io.BytesIO()
     pictures[0].save(
         file,
@@ -128,10 +144,13 @@ def _write_mp4(painter: FramePainter, frames: Sequence[int], path: Path) -> None
         ) from error
 
     look = painter.look
+    # Exact, as a fraction.
     rate = Fraction(look.fps).limit_denominator()
+    # Pictures come as plain bytes through its standard input.
     raw = f"-f rawvideo -pix_fmt rgb24 -s {look.width}x{look.height} -r {rate} -i -"
+    options = f"-y -v error {raw} {_H264}".split()
     with atomic_path(path) as part:
-        words = [ffmpeg, "-y", "-v", "error", *raw.split(), *_H264.split(), str(part)]
+        words = [ffmpeg, *options, str(part)]
         # In a session of its own, so that Ctrl-C reaches this process alone. ffmpeg ends with its
         # input.
         with Popen(words, stdin=PIPE, stderr=PIPE, start_new_session=True) as program:

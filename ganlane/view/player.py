@@ -30,8 +30,25 @@ from ganlane.settings.actions import LANE, NUMBERED
 from ganlane.settings.render import FilmConfig
 from ganlane.view.record import FloatArray, Trajectory
 
-#: Units of series: s, m, m, rad, m/s, m/s2, m/s3.
-UNITS = dict(time=0.01, x=0.01, y=0.01, heading=0.001, speed=0.01, acceleration=0.01, jerk=0.1)
+#: Units of series.
+UNITS = {
+    "time": 0.01,  # s
+    "x": 0.01,  # m
+    "y": 0.01,  # m
+    "heading": 0.001,  # rad
+    "speed": 0.01,  # m/s
+    "acceleration": 0.01,  # m/s2
+    "jerk": 0.1,  # m/s3
+}
+#: The page's scripts, in the order in which they run.
+_SCRIPTS = (
+    "episode.js",
+    "road.js",
+    "chart.js",
+    "events.js",
+    "panel.js",
+    "player.js",
+)
 
 
 def write_player(
@@ -49,10 +66,11 @@ def player_page(trajectories: Sequence[Trajectory], look: FilmConfig | None = No
         UserError: an episode is over by then.
     """
     look = look or FilmConfig()
-    labels = [trajectory.label for trajectory in trajectories]
-    title = ", ".join(dict.fromkeys(f"{label.agent} on {label.traffic}" for label in labels))
     episodes = [episode_data(trajectory, look.start_s) for trajectory in trajectories]
-    return _fill(title, {"units": UNITS, "episodes": episodes})
+    # Once each, in their order.
+    labels = [trajectory.label for trajectory in trajectories]
+    names = dict.fromkeys(f"{label.agent} on {label.traffic}" for label in labels)
+    return _fill(", ".join(names), {"units": UNITS, "episodes": episodes})
 
 
 def _fill(title: str, data: dict[str, Any]) -> str:
@@ -63,9 +81,8 @@ def _fill(title: str, data: dict[str, Any]) -> str:
         return (folder / name).read_text(encoding="utf-8")
 
     style = text("style.css")
-    # in this order
-    names = ("episode.js", "road.js", "chart.js", "events.js", "panel.js", "player.js")
-    script = "(() => {\n'use strict';\n" + "\n".join(map(text, names)) + "})();\n"
+    # In a function, so that the page's names are not global.
+    script = "(() => {\n'use strict';\n" + "\n".join(map(text, _SCRIPTS)) + "})();\n"
     # Only these two texts may run: nothing that is put into the page as data can.
     allowed = f"style-src {_hash(style)}; script-src {_hash(script)}"
     parts = {
@@ -75,7 +92,8 @@ def _fill(title: str, data: dict[str, Any]) -> str:
         "script": script,
         "data": script_safe_json(data),
     }
-    # A function, since backslashes in a replacement text would be escapes.
+    # ``{{title}}`` becomes the part "title". By a function, since backslashes in a replacement text
+    # would be escapes.
     return re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], text("page.html"))
 
 
@@ -88,7 +106,8 @@ def script_safe_json(data: Any) -> str:
 
 def _hash(text: str) -> str:
     """Name of an allowed script or style in the page's content security policy."""
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+    digest = hashlib.sha256(text.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode()}'"
 
 
 def series(values: FloatArray, unit: float) -> list[int]:
@@ -107,7 +126,12 @@ def steps(values: npt.NDArray[Any]) -> list[Any]:
     is_whole = values.dtype.kind != "f"
     changes: list[Any] = []
     for sample, value in enumerate(values.tolist()):
-        shown = int(value) if is_whole else round(value, 2) if np.isfinite(value) else None
+        shown: float | None = None
+        if is_whole:
+            shown = int(value)
+        elif np.isfinite(value):
+            shown = round(value, 2)
+        # The list ends with the value before.
         if not changes or shown != changes[-1]:
             changes += (sample, shown)
     return changes
@@ -128,42 +152,60 @@ def episode_data(trajectory: Trajectory, start_s: float = 0.0) -> dict[str, Any]
         ``comfort``: the ego's ``rms_acceleration`` and ``hardest_braking`` (0 or below), m/s2, and
         ``rms_jerk``, m/s3; ``soft_crash``, the ends of the decisions with any, s. Rewards and
         action values are empty if unknown.
+
+    Raises:
+        UserError: the episode is over by ``start_s``.
     """
     t = trajectory.since(start_s)
-    # A frame has the action and reward of the decision that led to it; the player shows those of
-    # the decision that begins there, so they are taken from the next frame.
-    under_way = np.minimum(np.arange(len(t)) + 1, len(t) - 1)
-    acceleration = t.acceleration[:, 0]
-    jerk = ego_jerk(trajectory)[-len(t) :]
     data: dict[str, Any] = {
         **asdict(t.label),
         "outcome": t.outcome,
         "time": series(t.time_s, UNITS["time"]),
     }
+    # Arrays are [T, M]: a row of the transposed one is a vehicle's.
     for name in ("x", "y", "heading", "speed"):
         data[name] = [series(row, UNITS[name]) for row in getattr(t, name).T]
     for name in ("length", "width", "target_lane", "valid"):
         data[name] = [steps(row) for row in getattr(t, name).T]
+
+    acceleration = t.acceleration[:, 0]
+    # Of the whole episode, since the first sample needs the one before.
+    jerk = ego_jerk(trajectory)[-len(t) :]
+    hardest_braking = min(0.0, float(acceleration.min()))
+
+    # A frame has the action and reward of the decision that led to it; the player shows those of
+    # the decision that begins there, so they are taken from the next frame.
+    under_way = np.minimum(np.arange(len(t)) + 1, len(t) - 1)
+    reward: list[Any] = []
+    if np.isfinite(t.reward).any():
+        reward = steps(t.reward[under_way])
     # Rule-based drivers have no action values; the page gets an empty list for them.
-    knows_values = np.isfinite(t.action_values).any()
-    knows_reward = np.isfinite(t.reward).any()
+    action_values: list[Any] = []
+    if np.isfinite(t.action_values).any():
+        action_values = [steps(row) for row in t.action_values[under_way].T]
+    # What happened before the first sample is not shown.
+    soft_crash_s = t.soft_crash_s[t.soft_crash_s >= t.time_s[0]]
+
     return data | {
         "acceleration": series(acceleration, UNITS["acceleration"]),
         "jerk": series(jerk, UNITS["jerk"]),
         "action": steps(t.action[under_way]),
-        "reward": steps(t.reward[under_way]) if knows_reward else [],
+        "reward": reward,
         "return": steps(t.returns),
-        "action_values": (
-            [steps(row) for row in t.action_values[under_way].T] if knows_values else []
-        ),
+        "action_values": action_values,
         "action_names": list(NUMBERED[LANE]),
         "comfort": {
-            "rms_acceleration": round(float(np.sqrt(np.mean(acceleration**2))), 3),
-            "rms_jerk": round(float(np.sqrt(np.mean(jerk**2))), 3),
-            "hardest_braking": round(min(0.0, float(acceleration.min())), 3),
+            "rms_acceleration": _rms(acceleration),
+            "rms_jerk": _rms(jerk),
+            "hardest_braking": round(hardest_braking, 3),
         },
-        "soft_crash": t.soft_crash_s[t.soft_crash_s >= t.time_s[0]].round(2).tolist(),
+        "soft_crash": soft_crash_s.round(2).tolist(),
     }
+
+
+def _rms(values: FloatArray) -> float:
+    """Root mean square, to three decimals."""
+    return round(float(np.sqrt(np.mean(values**2))), 3)
 
 
 def ego_jerk(trajectory: Trajectory) -> FloatArray:

@@ -52,16 +52,25 @@ class EpisodeLabel:
     ) -> EpisodeLabel:
         """Of a row of ``state``: on its replayed scene if it has one, else on ``road``."""
         scene = road_in(state, road)
-        # One number for all rows, or [N, 1].
-        lanes, width_m = (
-            torch.as_tensor(size).flatten().expand(state.batch_size)[row]
-            for size in (scene.lanes, scene.lane_width_m)
-        )
+
+        def of_row(size: Tensor | float) -> Tensor:
+            """One number for all rows, or [N, 1]: the row's."""
+            return torch.as_tensor(size).flatten().expand(state.batch_size)[row]
+
+        lanes = int(of_row(scene.lanes))
         stretches = scene.stretches
         if scene.row_stretches is not None:
-            stretches = stretches_of_row(scene.row_stretches, row)[: int(lanes)]
-        seed, episode = (int(state[name][row]) for name in (keys.SEED, keys.EPISODE))
-        return cls(agent, traffic, seed, episode, int(lanes), float(width_m), stretches)
+            # The widest scene decides how many there are; this one may have fewer.
+            stretches = stretches_of_row(scene.row_stretches, row)[:lanes]
+        return cls(
+            agent,
+            traffic,
+            int(state[keys.SEED][row]),
+            int(state[keys.EPISODE][row]),
+            lanes,
+            float(of_row(scene.lane_width_m)),
+            stretches,
+        )
 
 
 @dataclass(frozen=True)
@@ -112,8 +121,10 @@ class Trajectory:
 
     def overlapping(self) -> BoolArray:
         """Whether a vehicle's box overlaps another's, [T, M]."""
+        # The frames as if they were T environments; fields that are not recorded do not matter.
         fields: dict[str, Any] = dict.fromkeys(keys.VEHICLE_FIELDS, torch.zeros(self.x.shape))
-        fields |= {name: torch.as_tensor(getattr(self, name)) for name in _FIELDS}
+        for name in _FIELDS:
+            fields[name] = torch.as_tensor(getattr(self, name))
         return pair_overlaps(Vehicles(**fields)).any(-1).numpy()
 
     def since(self, start_s: float) -> Trajectory:
@@ -128,11 +139,11 @@ class Trajectory:
                 f"start at {start_s:g} s: the episode lasts {self.time_s[-1]:g} s; choose a part "
                 "of it."
             )
-        later: dict[str, Any] = {
-            name: value[first:]
-            for name, value in vars(self).items()
-            if name not in ("label", "outcome", "soft_crash_s")
-        }
+        later: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            # All other fields have one value per frame.
+            if name not in ("label", "outcome", "soft_crash_s"):
+                later[name] = value[first:]
         return replace(self, **later)
 
 
@@ -144,13 +155,17 @@ _FIELDS = tuple(name for name in keys.VEHICLE_FIELDS if name in Trajectory.__ann
 class Recorder:
     """Collects frames of one row; the environment calls it after each physics step."""
 
+    #: Index of the row.
     row: int = 0
     #: What a trajectory keeps of a frame, by its name there.
     frames: list[dict[str, Any]] = field(default_factory=list)
     #: Ends of the decisions with a soft crash, s.
     soft_crash_s: list[float] = field(default_factory=list)
+    #: Action of the decision under way; -1 before the first one.
     current_action: int = -1
+    #: Return up to the decision before.
     current_return: float = 0.0
+    #: Action values of the decision under way, [A]; NaN where unknown.
     current_values: FloatArray = field(default_factory=lambda: np.full(keys.ACTIONS, np.nan))
 
     @property
@@ -167,7 +182,7 @@ class Recorder:
             self.add(vehicles.as_dict(), self.time_s + keys.PHYSICS_STEP_S)
 
     def add(self, vehicles: Mapping[str, Tensor] | TensorDictBase, time_s: float) -> None:
-        """Append a frame."""
+        """Append a frame: the row's of ``vehicles`` [N, M], ``time_s`` after the reset."""
         frame: dict[str, Any] = {
             "time_s": time_s,
             "action": self.current_action,
@@ -177,15 +192,16 @@ class Recorder:
         }
         for name in _FIELDS:
             column = vehicles[name][self.row].detach().cpu().numpy()
+            dtype = np.float64 if column.dtype.kind == "f" else column.dtype
             # A copy, since the environment may write into its own.
-            frame[name] = column.astype(np.float64 if column.dtype.kind == "f" else column.dtype)
+            frame[name] = column.astype(dtype)
         self.frames.append(frame)
 
     def trajectory(self, label: EpisodeLabel, outcome: str = "") -> Trajectory:
         """The frames so far; the last one shows the return after the last decision."""
-        arrays: dict[str, Any] = {
-            name: np.stack([frame[name] for frame in self.frames]) for name in self.frames[0]
-        }
+        arrays: dict[str, Any] = {}
+        for name in self.frames[0]:
+            arrays[name] = np.stack([frame[name] for frame in self.frames])
         # Sums of 0.1 s are off by rounding.
         arrays["time_s"] = arrays["time_s"].round(6)
         arrays["returns"][-1] = self.current_return
@@ -196,7 +212,10 @@ class Recorder:
 def outcome_of(state: TensorDictBase) -> str:
     """The event that ended the episode of the first row; empty where none did."""
     events = state[keys.EVENTS]
-    return next((name for name in keys.END_EVENTS if bool(events[name][0])), "")
+    for name in keys.END_EVENTS:
+        if bool(events[name][0]):
+            return name
+    return ""
 
 
 def record_episode(
@@ -209,6 +228,8 @@ def record_episode(
     max_time_s: float | None = None,
 ) -> Trajectory:
     """Drive one episode to its end and record it at every physics step.
+
+    The environment's own recorder, if it has one, rests meanwhile.
 
     Args:
         env: batched environment; all rows run the episode, row 0 is recorded. One row is enough.
@@ -229,13 +250,18 @@ def record_episode(
             f"env={type(base).__name__}: it cannot be recorded; expected a HighwayEnv of this "
             "process."
         )
+
     recorder = Recorder()
+    # Times are sums of 0.1 s, a little off by rounding.
     end_s = np.inf if max_time_s is None else max_time_s - 1e-6
-    before, base.recorder = base.recorder, recorder
+    # The environment may have one already, which is put back.
+    before = base.recorder
+    base.recorder = recorder
     try:
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             state = env.reset(start_of(env, [episode], seed))
             label = EpisodeLabel.of(state, base.road, agent, traffic)
+            # The state after the reset, to which no decision has led.
             recorder.add(state[keys.VEHICLES], 0.0)
             while not state["done"][0] and recorder.time_s < end_s:
                 state = _decide(env, policy, state, recorder)
@@ -247,7 +273,8 @@ def record_episode(
 def _decide(
     env: EnvBase, policy: TensorDictModuleBase, state: TensorDictBase, recorder: Recorder
 ) -> TensorDictBase:
-    """One decision; the state after it."""
+    """One decision of ``policy`` in ``state``, noted by the recorder; the state after it."""
+    # What the recorder notes in the frames of this decision.
     state = policy(state)
     action = state[keys.ACTION][0]
     # Acceleration and line have no number; pictures then name no action.
@@ -255,9 +282,13 @@ def _decide(
     if isinstance(policy, GreedyPolicy):
         values = policy.network.values(state[keys.OBSERVATION])
         recorder.current_values = values[0].double().cpu().numpy()
+
+    # The environment calls the recorder after each of its physics steps.
     first = len(recorder.frames)
     stepped = env.step(state)
     after = stepped["next"]
+
+    # Only now the reward is known.
     reward = float(after[keys.REWARD][0])
     for frame in recorder.frames[first:]:
         frame["reward"] = reward

@@ -20,6 +20,13 @@ def write_tracks(trajectories: Sequence[Trajectory], path: str | Path) -> Path:
 
     Each is a scene, ``AGENT_TRAFFIC_SEED_EPISODE``; a number follows where two would be alike. It
     is Parquet in the schema of recordings (:mod:`ganlane.data.schema`).
+
+    Args:
+        trajectories: the recorded episodes, one or more.
+        path: file to write.
+
+    Returns:
+        The path.
     """
     # The same driver, traffic, seed and episode may come twice; scenes need names of their own.
     times = Counter[str]()
@@ -28,17 +35,29 @@ def write_tracks(trajectories: Sequence[Trajectory], path: str | Path) -> Path:
         label = trajectory.label
         name = f"{Path(label.agent).stem}_{label.traffic}_{label.seed}_{label.episode}"
         times[name] += 1
-        number = f"-{times[name]}" if times[name] > 1 else ""
-        tables.append(to_tracks(trajectory, name + number))
+        scene = name if times[name] == 1 else f"{name}-{times[name]}"
+        tables.append(to_tracks(trajectory, scene))
     write_prepared(sort(pl.concat(tables)), path)
     return Path(path)
 
 
 def to_tracks(trajectory: Trajectory, scene: str = "simulated") -> pl.DataFrame:
-    """The trajectory in the schema of recordings; a recycled vehicle begins a new track."""
-    # Numbers of later tracks lie a whole stride higher, so none is used twice.
+    """The trajectory in the schema of recordings, as a scene of this name.
+
+    A recycled vehicle begins a new track.
+    """
+    # Numbers of later tracks lie a whole stride higher, so none is used twice; [T, M].
     jumps = np.cumsum(trajectory.jumped(), axis=0)
     numbers = np.arange(jumps.shape[1]) + TRACK_STRIDE * jumps
-    values = {name: getattr(trajectory, name) for name in ("x", "y", "speed", "length", "width")}
-    lane = trajectory.lane()
-    return sort(track_table(scene, trajectory.valid, vehicle=numbers, lane=lane, **values))
+    table = track_table(
+        scene,
+        trajectory.valid,
+        vehicle=numbers,
+        x=trajectory.x,
+        y=trajectory.y,
+        speed=trajectory.speed,
+        lane=trajectory.lane(),
+        length=trajectory.length,
+        width=trajectory.width,
+    )
+    return sort(table)

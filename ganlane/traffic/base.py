@@ -233,7 +233,12 @@ class Overlay(TrafficModule):
     heeds_lane_ends = True  # as far as the model below does
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """The new ``moved``, and the memory to keep; arguments as in :meth:`TrafficModule.move`."""
         raise NotImplementedError

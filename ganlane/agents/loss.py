@@ -56,6 +56,11 @@ _BETA_2 = 0.999
 class _OfRainbow:
     """What is ours in both losses: a second module with the loss's target parameters, whose noise
     can be drawn anew, and a forward pass on plain tensors, with a mask of the next actions.
+
+    Attributes:
+        network: that learns.
+        target_network: that values the next actions.
+        config: of the agent.
     """
 
     network: QNetwork
@@ -144,10 +149,14 @@ class _OfRainbow:
 
 
 class LeanDistributionalLoss(_OfRainbow, DistributionalDQNLoss):
-    """Categorical (C51) loss of a distributional ``network``, by its ``config``."""
+    """Categorical (C51) loss of a distributional ``network``, by its ``config``.
+
+    Bellemare et al. 2017; with ``config.double`` the double one of Rainbow.
+    """
 
     def __init__(self, network: QNetwork) -> None:
-        # TorchRL's actor gives its loss the parameters and keys; the forward above does not call it
+        # TorchRL's actor gives its loss the parameters and keys; the forward above does not call
+        # it.
         actor = DistributionalQValueActor(
             network,
             network.support,
@@ -259,7 +268,15 @@ class Batch(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """What an update gives: ``priority`` [B], the others 0-dim (``loss`` is weighted)."""
+    """What an update gives; 0-dim unless said otherwise.
+
+    Attributes:
+        priority: of the transitions, [B].
+        loss: weighted mean over the batch.
+        mean_q: mean value of the best next actions.
+        clamped_fraction: mass of the targets outside the support.
+        gradient_norm: before the clipping.
+    """
 
     priority: Tensor
     loss: Tensor
@@ -269,7 +286,13 @@ class Learned(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """What does not change during a training."""
+    """What does not change during a training.
+
+    Attributes:
+        gamma: discount per decision.
+        gradient_clip: largest norm of the gradient of all parameters.
+        adam_eps: Adam's epsilon.
+    """
 
     gamma: float
     gradient_clip: float
@@ -277,7 +300,9 @@ class Settings(NamedTuple):
 
 
 def composed_layers(
-    parameters: list[Tensor], noise: Sequence[Sequence[Tensor]], actions: int
+    parameters: list[Tensor],
+    noise: Sequence[Sequence[Tensor]],
+    actions: int,
 ) -> Weights:
     """Weight and bias of every layer of a network (Fortunato et al. 2017), the duel folded into the
     last.
@@ -453,7 +478,13 @@ def update(
 
 
 class UpdateGraph:
-    """The compiled :func:`update` of an agent, on the tensors of its networks and its optimiser."""
+    """The compiled :func:`update` of an agent, on the tensors of its networks and its optimiser.
+
+    Args:
+        network, target: with all six components of Rainbow, on a CPU.
+        optimizer: of the parameters of ``network``; its state is made and changed here.
+        config: of the agent.
+    """
 
     def __init__(
         self,

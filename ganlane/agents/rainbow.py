@@ -41,6 +41,15 @@ class Rainbow:
         compile: whether an update runs as one compiled graph
             (:class:`ganlane.agents.loss.UpdateGraph`), where that can do what ``config`` says; the
             same up to rounding, and faster on a CPU.
+
+    Attributes:
+        network, target: the online network, which learns, and the one that values.
+        policy, greedy: exploring, to collect, and without exploration.
+        updates: since the start of the training.
+        graph: the compiled update; None: it is computed step by step.
+
+    Raises:
+        ParameterError: a learning rate falls, and it is not said within how many decisions.
     """
 
     def __init__(
@@ -91,8 +100,6 @@ class Rainbow:
         self.policy = ExploringPolicy(self.network, self.generators["collect"], legal)
         self.greedy = GreedyPolicy(self.network)
 
-        # Since the start of the training.
-        self.updates = 0
         # The graph is of the whole of Rainbow; with any part left out the update is computed step
         # by step.
         parts = ("distributional", "double", "dueling", "noisy", "prioritised", "kl_priority")
@@ -100,6 +107,8 @@ class Rainbow:
         self.graph: UpdateGraph | None = None
         if compile and is_whole and self.device.type == "cpu":
             self.graph = UpdateGraph(self.network, self.target, self.optimizer, config)
+
+        self.updates = 0
         self.anneal(0)
 
     @property

@@ -141,10 +141,17 @@ class HumanTraffic(TrafficModule):
         step: Tensor,
         due: Tensor,
     ) -> Moved:
-        """Decisions in the rows where one is ``due`` [N]: rows begin at steps of their own.
+        """Decisions in the rows where one is due: rows begin at steps of their own.
 
         On a CPU the other rows are left out of the policy; elsewhere all rows decide, since to
         count those that are due would wait for the device or break a compiled graph.
+
+        Args:
+            vehicles, memory, key, step: as of :meth:`move`.
+            due: bool [N].
+
+        Returns:
+            Vehicles and memory, in the other rows as they were.
         """
         if not reads_are_cheap(vehicles.x):
             decided, new_memory = self.decide(vehicles, memory, key, step)
@@ -175,6 +182,12 @@ class HumanTraffic(TrafficModule):
 
         Perceive, choose a lane, draw a move, bound it: the policy knows roads whose lanes go on for
         ever, and where lanes end rules come on top of it.
+
+        Args:
+            vehicles, memory, key, step: as of :meth:`move`.
+
+        Returns:
+            The vehicles with their new target lanes, and the memory.
         """
         policy = in_dtype(self.policy, vehicles.x.dtype)
         variation = self.drivers.variation
@@ -196,10 +209,13 @@ class HumanTraffic(TrafficModule):
         sides = option.sides.clone()
         option.sides[..., REAR_BRAKING] *= variation.politeness
         if self.road.stretches:
+            # Only to lanes that are there, beside the driver.
             ways = ways_out(vehicles, self.road, self.mobil.mandatory_m)
             option = option._replace(exists=torch.stack((ways.left, ways.right), -1))
         chances = policy.lane_chances(option, variation.lane_changes)
         choice = chosen(chances, u_lane)
+
+        # Whose lane ends may have to leave it, whatever the policy says.
         if self.road.stretches:
             choice = _leaving(choice, option.keeping, ways, sides, u_leaving)
         situation = with_choice(situation, choice)
@@ -210,6 +226,8 @@ class HumanTraffic(TrafficModule):
         change = ALONG.sample(along, u_along, variation.temperature)
         aside = ACROSS.sample(across, u_across, variation.temperature)
         acceleration, lateral = bounded(situation, change, aside)
+
+        # The end of a lane, and who has to leave one, bound the acceleration further.
         if self.road.stretches:
             before_walls = self._before_walls(vehicles, scene)
             acceleration = torch.minimum(acceleration, before_walls)
@@ -255,7 +273,13 @@ class HumanTraffic(TrafficModule):
         return torch.where(is_ahead, acceleration, torch.inf).amin(-1)
 
 
-def _leaving(choice: Tensor, keeping: Tensor, ways: WaysOut, sides: Tensor, u: Tensor) -> Tensor:
+def _leaving(
+    choice: Tensor,
+    keeping: Tensor,
+    ways: WaysOut,
+    sides: Tensor,
+    u: Tensor,
+) -> Tensor:
     """The choices of drivers whose lane ends: out of it, the sooner the nearer its end is.
 
     Recordings show no such lanes, so this is no part of the policy. Like its own changes these

@@ -52,7 +52,8 @@ class MixedTraffic(TrafficParts):
     """
 
     def __init__(self, parts: Mapping[str, TrafficModule], shares: Mapping[str, int]) -> None:
-        if not parts or set(parts) != set(shares) or min(shares.values()) < 1:
+        same_names = set(parts) == set(shares)
+        if not parts or not same_names or min(shares.values()) < 1:
             raise UserError(
                 f"traffic.shares={dict(shares)}: expected a whole number of at least 1 for each of "
                 f"the parts ({', '.join(parts) or 'none'}); give for instance "
@@ -88,7 +89,7 @@ class MixedTraffic(TrafficParts):
         self._rows: tuple[Tensor, list[RowsOfPart]] | None = None
 
     def native_drivers(self) -> Drivers | None:
-        """Those of the parts, in turns."""
+        """Those of the parts, in turns; None where the kernel cannot drive one of them."""
         parts = {name: part.native_drivers() for name, part in self.named_parts()}
         return mixed_drivers(parts, self._shares)
 
@@ -98,9 +99,12 @@ class MixedTraffic(TrafficParts):
         return turns[episode % len(turns)]
 
     def rows_of_parts(self, episode: Tensor) -> list[RowsOfPart]:
-        """The parts that have rows in the batch of ``episode`` [N].
+        """The parts that have rows in the batch, and their rows.
 
         On a GPU this waits for the queue once.
+
+        Args:
+            episode: number of the episode of every row, [N] int64.
         """
         part_of_row = self.part_of(episode)
         numbers = torch.arange(len(self.parts), device=episode.device)
@@ -159,6 +163,7 @@ class MixedTraffic(TrafficParts):
         n = len(key)
         together = new_tensordict(vehicles.as_dict(), n)
         memories = new_tensordict(zero_memory(self.memory_fields, vehicles.x), n)
+
         for name, part, rows in self.rows_of_parts(episode):
             # A traffic sees only its own rows of the scene.
             scene = vehicles.part(rows)
@@ -171,6 +176,7 @@ class MixedTraffic(TrafficParts):
             entered, memory = part.enter(scene, key[rows], episode[rows])
             together = with_rows(together, rows, entered.as_dict())
             memories.set(name, with_rows(memories.get(name), rows, memory))
+
         return Vehicles.of(together), memories
 
 
@@ -226,7 +232,12 @@ class BlindTraffic(TrafficModule):
         return tensordict.set(keys.TRAFFIC, output.get(keys.TRAFFIC))
 
     def unseen(self, vehicles: Vehicles, key: Tensor) -> Tensor:
-        """The egos of blind episodes, bool [N, M]; ``key`` [N] of the episodes."""
+        """The egos of blind episodes, bool [N, M].
+
+        Args:
+            vehicles: at any step, [N, M].
+            key: of the episodes, [N] int64.
+        """
         # Drawn before the first step, by a key of its own. In float64, so that the same episodes
         # are blind in runs of either float type.
         entering = absorb(key, 0)

@@ -208,7 +208,10 @@ class CalibratedLaneChange(Overlay):
         self._limits = self.changes.limits()
 
     def _wishes(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Tensor:
-        """The current wish, or a new one: a side [N, M], -1 right, 0 none, 1 left."""
+        """The current wish, or a new one: a side [N, M], -1 right, 0 none, 1 left.
+
+        The ego has none: what it does is not this model's.
+        """
         u, u_side = uniforms(vehicles, key, step, *_CHANGE)
 
         # At a constant rate per kilometre driven: the probability of at least one event of a
@@ -231,7 +234,15 @@ class CalibratedLaneChange(Overlay):
         return without_ego(wish)
 
     def _contested(self, scene: Scene, lane: Tensor) -> Tensor:
-        """Whether a near vehicle other than the ego is already moving into ``lane`` [N, M]."""
+        """Whether a near vehicle other than the ego is already moving into a driver's new lane.
+
+        Args:
+            scene: at t.
+            lane: that each driver would change to, [N, M] float.
+
+        Returns:
+            bool [N, M].
+        """
         vehicles = scene.vehicles
         pairs = scene.pairs
 
@@ -283,9 +294,21 @@ class CalibratedLaneChange(Overlay):
 
 
 def _accelerated(
-    vehicles: Vehicles, moved: Vehicles, who: Tensor, acceleration: Tensor, dt: float
+    vehicles: Vehicles,
+    moved: Vehicles,
+    who: Tensor,
+    acceleration: Tensor,
+    dt: float,
 ) -> Vehicles:
-    """``moved``, where ``who`` [N, M] drives along the road at ``acceleration``, m/s2."""
+    """``moved``, where ``who`` drives along the road at another acceleration.
+
+    Args:
+        vehicles: at t.
+        moved: at t + ``dt``, s.
+        who: bool [N, M]; the others stay as they are in ``moved``.
+        acceleration: m/s2, [N, M].
+        dt: length of the step, s.
+    """
     speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
     # As realised, not as asked for: braking ends at a standstill.
     realised = (speed - vehicles.speed) / dt
@@ -383,7 +406,10 @@ class Guard(Overlay):
         self.closest = replace(idm, headway_s=self.guard.headway_s)
 
     def along(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
-        """``moved`` with its acceleration between the bounds by IDM."""
+        """``moved`` with its acceleration between the bounds by IDM.
+
+        Who is within them moves bit for bit as the parts before the guard say.
+        """
         guard = self.guard
         # With the new target lane: the guard also looks where the change goes.
         scene = perceive(vehicles.with_(target_lane=moved.target_lane), self.road)
@@ -401,9 +427,8 @@ class Guard(Overlay):
         wanted = (moved.speed - vehicles.speed) / self.dt
         # Where the bounds cross, the upper one holds: keeping off the leader comes first.
         acceleration = wanted.clamp(lowest, highest)
-        # Who is within the bounds moves bit for bit as the chain says.
-        bounded = acceleration != wanted
-        return _accelerated(vehicles, moved, bounded, acceleration, self.dt)
+        is_bounded = acceleration != wanted
+        return _accelerated(vehicles, moved, is_bounded, acceleration, self.dt)
 
     def across(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
         """``moved`` pulled towards its lane's centre, and kept inside the edges of the road.

@@ -3,6 +3,8 @@
 All samples are in one table. A sample is one vehicle in one frame; the samples of a track follow
 each other, 0.1 s apart, so ``k`` steps after sample ``s`` the vehicle is at sample ``s + k``, as
 long as its track lasts.
+
+Shapes: R samples, S scenes, and K starts of episodes with up to P vehicles each.
 """
 
 from __future__ import annotations
@@ -184,7 +186,8 @@ class ReplayTraffic(TrafficModule):
     visibility = Visibility.BODY
     own_roads = True
 
-    # Of every sample: its float fields, [R, 8] float64, and the last sample of its track, [R].
+    # Of every sample: its float fields, ordered as VEHICLE_FLOATS, [R, 8] float64, and the last
+    # sample of its track, [R].
     samples: Tensor
     last: Tensor
 
@@ -234,10 +237,10 @@ class ReplayTraffic(TrafficModule):
             return_counts=True,
         )
         scene_names = tuple(names.tolist())
+
         counts = scene_lane_counts(frame)
         lanes = torch.tensor([counts[name] for name in scene_names])
         width_m = torch.tensor([widths[name] for name in scene_names], dtype=torch.float64)
-
         # For sizes only; the road of a row is road_of's.
         road = Road(int(lanes.max()), float(width_m.mean()))
         super().__init__(road, stream)
@@ -254,6 +257,7 @@ class ReplayTraffic(TrafficModule):
             "lane_width_m": width_m,
             "stretches": None if roads is None else self._stretches(roads, counts),
         }
+        # Not saved with an agent or a run: they are those of the file.
         for name, tensor in buffers.items():
             self.register_buffer(name, tensor, persistent=False)
 
@@ -277,8 +281,11 @@ class ReplayTraffic(TrafficModule):
                     f"{path}: {name}: {len(stretches)} lanes; expected the {lanes[name]} of the "
                     "recording, from the right."
                 )
-        go_on = {name: (LaneStretch(),) * count for name, count in lanes.items()}
-        of_scenes = [(go_on | roads)[name] for name in self.scene_names]
+
+        # By default a lane has no ends.
+        by_scene = {name: (LaneStretch(),) * count for name, count in lanes.items()}
+        by_scene |= roads
+        of_scenes = [by_scene[name] for name in self.scene_names]
         return torch.stack(stretches_of_roads(of_scenes), dim=1)
 
     def start_of(self, key: Tensor) -> Tensor:
@@ -292,16 +299,17 @@ class ReplayTraffic(TrafficModule):
         return self.first_start[scene] + start_in_scene
 
     def scenes_of_episodes(self, seed: int, episodes: Sequence[int]) -> list[str]:
-        """Name of the scene of each of ``episodes``, for figures by scene."""
-        scenes = self.scene[self._starts_of(seed, episodes)]
-        return [self.scene_names[number] for number in scenes.tolist()]
+        """Name of the scene of each of the ``episodes`` with ``seed``, for figures by scene."""
+        starts = self.start_of(self._keys_of(seed, episodes))
+        scenes = self.scene[starts].tolist()
+        return [self.scene_names[number] for number in scenes]
 
     def cars_of_episodes(self, seed: int, episodes: Sequence[int]) -> list[int]:
         """A number for the recorded car that the ego replaces in each of ``episodes``.
 
         Episodes of one car begin a tenth of a second apart: they are near copies of each other.
         """
-        starts = self._starts_of(seed, episodes)
+        starts = self.start_of(self._keys_of(seed, episodes))
         replaced = self.starts[starts, 0]
         # The last sample of its track is nobody else's.
         return self.last[replaced].tolist()
@@ -312,28 +320,30 @@ class ReplayTraffic(TrafficModule):
         Every start is driven once. Left out are those at which the ego, which follows by ``idm``,
         would brake beyond :data:`HARD_BRAKING_MPS2` at once: the recorded driver was nearer to the
         vehicle ahead than IDM ever is, and a crash there is none of the agent's.
+
+        Args:
+            seed: of the episodes.
+            idm: the ego's.
         """
         # Scenes are equally likely, so a start of the longest scene comes once in so many episodes:
         # in 20 times as many hardly any start is missing.
         rarest = len(self.scene_names) * int(self.starts_in.max())
-        numbers = torch.arange(20 * rarest)
-        starts = self._starts_of(seed, numbers.tolist())
+        starts = self.start_of(self._keys_of(seed, range(20 * rarest)))
         _, first = np.unique(starts.cpu().numpy(), return_index=True)
-        numbers = numbers[torch.from_numpy(first).sort().values]
+        episodes = np.sort(first)
 
         # What the ego alone, vehicle 0, would do in the first frame of each.
-        key = episode_key(self.stream, torch.full_like(numbers, seed), numbers).to(starts.device)
+        key = self._keys_of(seed, episodes.tolist())
         vehicles = self.scenes(MOST_VEHICLES)(key, torch.float32)
         scene = perceive(vehicles, self.road_of(key), slice(0, 1))
         acceleration = following_acceleration(scene, idm)[:, 0]
-        softly = acceleration >= HARD_BRAKING_MPS2
-        return numbers[softly.cpu()].tolist()
+        brakes_softly = acceleration >= HARD_BRAKING_MPS2
+        return episodes[brakes_softly.cpu().numpy()].tolist()
 
-    def _starts_of(self, seed: int, episodes: Sequence[int]) -> Tensor:
-        """Number of the start of each of ``episodes``."""
+    def _keys_of(self, seed: int, episodes: Sequence[int]) -> Tensor:
+        """Keys [E] int64 of the ``episodes`` of this traffic's stream."""
         numbers = torch.tensor(list(episodes), dtype=torch.int64, device=self.scene.device)
-        key = episode_key(self.stream, torch.full_like(numbers, seed), numbers)
-        return self.start_of(key)
+        return episode_key(self.stream, torch.full_like(numbers, seed), numbers)
 
     def steps_of(self, key: Tensor) -> Tensor:
         """Physics steps until the scene ends, [N] int64.
@@ -343,17 +353,26 @@ class ReplayTraffic(TrafficModule):
         return self.steps[self.start_of(key)]
 
     def road_of(self, key: Tensor, dtype: torch.dtype = torch.float32) -> Road:
-        """The road of each row: ``lanes`` [N, 1] int64, ``lane_width_m`` [N, 1], and where its
-        lanes begin and end [N, L]; x = 0 is the ego's start.
+        """The road of each row; x = 0 is the ego's start.
+
+        Args:
+            key: of the episodes, [N] int64.
+            dtype: float type of the run.
+
+        Returns:
+            A road with ``lanes`` [N, 1] int64, ``lane_width_m`` [N, 1], and where its lanes begin
+            and end [N, L].
         """
         start = self.start_of(key)
         scene = self.scene[start]
+
         stretches = None
         if self.stretches is not None:
             # From the positions of the recording to those of the episode.
             of_scenes = RowStretches(*self.stretches[scene].unbind(1))
             ego_m = self.samples[self.starts[start, :1], _X]
             stretches = from_start(of_scenes, ego_m, dtype)
+
         return Road(
             self.lanes[scene][:, None],
             self.lane_width_m[scene][:, None].to(dtype),
@@ -407,7 +426,9 @@ class ReplayTraffic(TrafficModule):
         ego_visibility: int = Visibility.BODY,
         ego_desired_speed_mps: float = 25.0,
     ) -> RecordedScenes:
-        """The initial scenes of this traffic."""
+        """The initial scenes of this traffic; the arguments are those of
+        :class:`RecordedScenes`.
+        """
         return RecordedScenes(self, vehicles, ego_visibility, ego_desired_speed_mps)
 
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:

@@ -124,13 +124,18 @@ class EpisodeStats:
         self.weight = torch.where(done, 1.0, self.weight)
 
     def update(self, metrics: Mapping[str, Tensor]) -> None:
-        """Add the 0-dim ``metrics`` of one update."""
+        """Add the metrics of one update.
+
+        Args:
+            metrics: 0-dim tensors by name, on any device.
+        """
         # Summed on the device, without waiting for it.
         self.update_count += 1
         for name, value in metrics.items():
             self.updates[name] = self.updates.get(name, 0.0) + value
 
     def _add(self, name: str, value: Tensor) -> None:
+        """Add ``value`` to the sum of this name."""
         # In double precision: an interval may have millions of steps.
         self.sums[name] = self.sums.get(name, 0.0) + value.double()
 
@@ -149,8 +154,9 @@ class EpisodeStats:
         self.update_count = 0
 
         taken = sums.pop("actions", [])
+        actions = max(sum(taken), 1)
         for i, count in enumerate(taken):
-            row[f"action_{i}_share"] = count / max(sum(taken), 1)
+            row[f"action_{i}_share"] = count / actions
 
         episodes = sums.get("episodes", 0.0)
         row["episodes"] = episodes

@@ -170,8 +170,8 @@ class Rainbow:
     def _descend(self, batch: TensorDict, generator: torch.Generator) -> Learned:
         """What :class:`~ganlane.agents.loss.UpdateGraph` does, for every ``config`` and device."""
         # Both networks get new noise for every update.
-        for module in (self.network, self.target):
-            redraw_noise(module, generator)
+        redraw_noise(self.network, generator)
+        redraw_noise(self.target, generator)
 
         terms = self.loss(batch)
         # Without priorities all weigh the same.

@@ -6,7 +6,6 @@ Which one an episode gets follows from its number or key, so it is the same in e
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -51,6 +50,9 @@ class MixedTraffic(TrafficParts):
         UserError: no parts, shares of other names, or a part that plays recordings.
     """
 
+    # [sum of the shares]: the index of the part whose turn it is.
+    turns: Tensor
+
     def __init__(self, parts: Mapping[str, TrafficModule], shares: Mapping[str, int]) -> None:
         same_names = set(parts) == set(shares)
         if not parts or not same_names or min(shares.values()) < 1:
@@ -79,8 +81,7 @@ class MixedTraffic(TrafficParts):
         if len(visibilities) == 1:
             self.visibility = visibilities.pop()
 
-        # [sum of the shares]: the index of the part whose turn it is. Not saved: it follows from
-        # the shares.
+        # Not saved: it follows from the shares.
         names = list(parts)
         turns = torch.tensor([names.index(name) for name in interleaved(shares)])
         self.register_buffer("turns", turns, persistent=False)
@@ -95,8 +96,7 @@ class MixedTraffic(TrafficParts):
 
     def part_of(self, episode: Tensor) -> Tensor:
         """Index of the part that each ``episode`` [N] belongs to, [N] int64."""
-        turns = cast(Tensor, self.turns)
-        return turns[episode % len(turns)]
+        return self.turns[episode % len(self.turns)]
 
     def rows_of_parts(self, episode: Tensor) -> list[RowsOfPart]:
         """The parts that have rows in the batch, and their rows.

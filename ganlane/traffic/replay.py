@@ -142,6 +142,7 @@ def _starts(samples: pl.DataFrame, least: int) -> tuple[pl.DataFrame, Tensor]:
     # Below every distance, so that this vehicle itself comes first.
     distance[place == ego] = -1.0
 
+    # Starts are numbered scene by scene in order of time, their vehicles nearest first.
     there = there.with_columns(distance=distance)
     there = there.sort("scene", "frame", "distance", "index")
     there = there.with_columns(

@@ -33,6 +33,7 @@ SUPPORT = ("atoms", "v_min", "v_max")
 
 def _place(name: str | Path) -> tuple[Path, int | None]:
     """File of an agent, and its seed if the file holds several trainings."""
+    # ``RECIPE@SEED``, or ``FILE@SEED``.
     recipe, _, digits = str(name).rpartition("@")
     if digits.isdecimal():
         seed = int(digits)
@@ -44,7 +45,10 @@ def _place(name: str | Path) -> tuple[Path, int | None]:
             name = recipe
         elif recipe.endswith(".safetensors"):
             return Path(recipe), seed
-    return CHECKPOINTS / f"{name}.safetensors" if name in SHIPPED else Path(name), None
+
+    if name in SHIPPED:
+        return CHECKPOINTS / f"{name}.safetensors", None
+    return Path(name), None
 
 
 def _seeds_file(recipe: str) -> Path:
@@ -58,7 +62,7 @@ def names_agent(name: str) -> bool:
     ``@SEED`` may follow.
     """
     file = str(_place(name)[0])
-    # a file's own name may end in @ and digits
+    # A file's own name may end in @ and digits.
     is_agent = file.endswith(".safetensors") or os.path.isfile(file)
     return is_agent and not name.endswith(".zip")
 
@@ -76,7 +80,7 @@ def with_seeds(name: str) -> list[str]:
     if not every:
         return [name]
     if recipe not in SHIPPED:
-        # a file of one's own, with several trainings
+        # A file of one's own, with several trainings.
         seeds = sorted(_read_several(Path(recipe))[1])
     elif _seeds_file(recipe).is_file():
         # One training is the shipped agent itself; the others are packed together.
@@ -93,6 +97,7 @@ def _read_several(path: Path) -> tuple[dict[str, Tensor], dict[int, dict[str, An
     """Tensors and, by seed, metadata of a file with several trainings."""
     tensors, metadata = load_weights(path, SEVERAL)
     agents = metadata.get("agents")
+    # As a file has it: a dictionary for each seed, in digits.
     if not isinstance(agents, dict) or not all(
         seed.isdecimal() and type(agents[seed]) is dict for seed in agents
     ):
@@ -120,9 +125,12 @@ def agent_file(name: str | Path) -> Path:
 def save_agent(path: str | Path, agent: Rainbow, metadata: Mapping[str, Any]) -> None:
     """Write the agent's online network atomically, as a ``.safetensors`` file.
 
-    ``metadata`` is JSON-serialisable; by convention ``observation`` (the name of the observation)
-    and ``training`` (traffic, decisions, results). The network's config and the code version are
-    added here.
+    Args:
+        path: of the file.
+        agent: whose network is written.
+        metadata: JSON-serialisable; by convention ``observation`` (the name of the observation)
+            and ``training`` (traffic, decisions, results). The network's config and the code
+            version are added here.
     """
     # Enough to build the network again without the run that trained it.
     network = agent.network.config.description()
@@ -137,13 +145,13 @@ def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict
         UserError: no such file, or not an agent that this version of ganlane wrote.
     """
     path = agent_file(name)
-    # None: a file with one agent
-    seed = _place(name)[1]
+    # None: a file with one agent.
+    _, seed = _place(name)
     if seed is None:
         weights, metadata = load_weights(path, "agent")
     else:
         tensors, agents = _read_several(path)
-        # the file says itself which trainings it holds
+        # The file says itself which trainings it holds.
         if seed not in agents:
             seeds = ", ".join(map(str, sorted(agents)))
             raise UserError(
@@ -156,6 +164,7 @@ def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict
             for key, value in tensors.items()
             if key.startswith(prefix)
         }
+
     # The description comes from a file, so any part of it may be missing or of a wrong type.
     try:
         config = NetworkConfig.described(metadata["network"])
@@ -177,7 +186,7 @@ def load_agent(
     """
     weights, config, metadata = read_agent(name)
     try:
-        # its parameters are drawn and at once replaced
+        # Its parameters are drawn and at once replaced.
         network = QNetwork(config)
         load_parameters(network, weights)
     except UserError as error:
@@ -203,12 +212,13 @@ def warm_start(
     Raises:
         UserError: the networks differ in what their weights mean.
     """
-    # first the mistake that is made most often
+    # First the mistake that is made most often.
     check_observation_size(name, network, agent.network.config.observation_size)
+
+    # What the weights mean must agree, not how they were learned.
     here = agent.config
     trained = network.agent
     ignored = ("noisy_sigma", *(() if here.distributional else SUPPORT))
-    # what the weights mean must agree, not how they were learned
     differing = [
         option
         for option in SHAPE
@@ -220,6 +230,7 @@ def warm_start(
             f"{as_options(here, differing)}); set {as_options(trained, differing)}, or "
             "start with init=none."
         )
+
     # Adam starts anew, as at the start of a training.
     agent.load_weights(weights)
 

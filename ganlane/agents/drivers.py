@@ -58,6 +58,9 @@ class GreedyPolicy(ObservationPolicy):
 
     There is never any noise, whatever the context says. Where the environment writes
     ``action_mask`` [N, A], it is the best of the allowed actions.
+
+    Args:
+        network: whose action values decide.
     """
 
     def __init__(self, network: QNetwork) -> None:
@@ -69,7 +72,8 @@ class GreedyPolicy(ObservationPolicy):
         # Without the noise of the layers: the same observation always gives the same action.
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             values = self.network.values(tensordict.get(keys.OBSERVATION))
-        return allowed_values(values, tensordict.get(keys.ACTION_MASK, None)).argmax(-1)
+        mask = tensordict.get(keys.ACTION_MASK, None)
+        return allowed_values(values, mask).argmax(-1)
 
 
 class ExploringPolicy(TensorDictModuleBase):
@@ -102,28 +106,36 @@ class ExploringPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` and ``chosen_action_value``."""
+        # None outside of any context.
         explore = exploration_type() in (None, ExplorationType.RANDOM)
         if explore:
             redraw_noise(self.network, self.generator)
         noise = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
         with set_exploration_type(noise):
             values = self.network.values(tensordict.get(keys.OBSERVATION))
+
         mask = tensordict.get(keys.ACTION_MASK, None)
         action = allowed_values(values, mask).argmax(-1)
         if explore and self.epsilon > 0.0:
             # Without a mask, too, random actions stay on the road where legal says how.
             if mask is None:
                 mask = torch.ones_like(values) if self.legal is None else self.legal(tensordict)
-            # A fraction epsilon of the actions becomes a legal one, drawn uniformly.
-            draw: dict[str, Any] = {"generator": self.generator, "device": self.generator.device}
-            # the largest of uniform numbers, 0 where not allowed, is a uniform draw
-            lottery = torch.rand(mask.shape, **draw) * mask
-            action = torch.where(
-                torch.rand(action.shape, **draw) < self.epsilon, lottery.argmax(-1), action
-            )
-        # for the statistics: what the policy expects of its choice
-        chosen = values.gather(-1, action[..., None])
-        return tensordict.set(keys.ACTION, action).set(keys.CHOSEN_VALUE, chosen)
+            action = self._with_random(action, mask)
+
+        # For the statistics: what the policy expects of its choice.
+        chosen_value = values.gather(-1, action[..., None])
+        tensordict.set(keys.ACTION, action)
+        return tensordict.set(keys.CHOSEN_VALUE, chosen_value)
+
+    def _with_random(self, action: Tensor, allowed: Tensor) -> Tensor:
+        """``action`` [N], of which a share epsilon becomes an ``allowed`` [N, A] one, drawn
+        uniformly.
+        """
+        draw: dict[str, Any] = {"generator": self.generator, "device": self.generator.device}
+        # The place of the largest of uniform numbers, 0 where not allowed, is a uniform draw.
+        lottery = torch.rand(allowed.shape, **draw) * allowed
+        is_random = torch.rand(action.shape, **draw) < self.epsilon
+        return torch.where(is_random, lottery.argmax(-1), action)
 
 
 class FunctionPolicy(ObservationPolicy):
@@ -142,14 +154,15 @@ class FunctionPolicy(ObservationPolicy):
     def act(self, tensordict: TensorDictBase) -> Tensor:
         """What the function returns."""
         observation = tensordict.get(keys.OBSERVATION)
-        chosen = torch.as_tensor(self.function(observation.cpu().numpy()))
-        if chosen.shape != observation.shape[:1] or chosen.is_floating_point():
+        returned = self.function(observation.cpu().numpy())
+        action = torch.as_tensor(returned)
+        if action.shape != observation.shape[:1] or action.is_floating_point():
             name = getattr(self.function, "__name__", "the function")
             raise UserError(
-                f"{name}: returned {chosen.dtype} {list(chosen.shape)} for observations "
+                f"{name}: returned {action.dtype} {list(action.shape)} for observations "
                 f"{list(observation.shape)}; return a whole number 0, 1 or 2 for each row."
             )
-        return chosen.long().to(observation.device)
+        return action.long().to(observation.device)
 
 
 class MaskedPolicy(TensorDictModuleBase):
@@ -173,13 +186,17 @@ class MaskedPolicy(TensorDictModuleBase):
         """Write ``action``."""
         mask = mask_in(tensordict)
         action = self.policy(tensordict).get(keys.ACTION)
-        # whether the policy's own choice is among the allowed ones
-        allowed = mask.gather(1, action[:, None])[:, 0]
-        return tensordict.set(keys.ACTION, torch.where(allowed, action, keys.KEEP))
+        # Whether the policy's own choice is among the allowed ones.
+        is_allowed = mask.gather(1, action[:, None])[:, 0]
+        return tensordict.set(keys.ACTION, torch.where(is_allowed, action, keys.KEEP))
 
 
 def mask_in(tensordict: TensorDictBase) -> Tensor:
-    """The environment's ``action_mask`` [N, 3] bool; raises :class:`UserError` if it has none."""
+    """The environment's ``action_mask`` [N, A] bool.
+
+    Raises:
+        UserError: it has none.
+    """
     mask = tensordict.get(keys.ACTION_MASK, None)
     if mask is None:
         raise UserError(
@@ -194,9 +211,13 @@ class Driver(TensorDictModuleBase):
 
     Set ``rows_must_stay = True`` in one that remembers something per row in the module itself: an
     evaluation then never moves a running episode to another row, or into a smaller batch.
+
+    Args:
+        road: under the ego, where the state does not say another one.
+        stream: family of episodes that the random numbers belong to.
     """
 
-    # the simulator's raw state, without the observation's errors
+    # The simulator's raw state, without the observation's errors.
     in_keys = [keys.VEHICLES, keys.EGO, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
     out_keys = [keys.ACTION]  # noqa: RUF012
     rows_must_stay = False
@@ -223,11 +244,17 @@ def legal_actions(
 
     Of ``lane_speed`` also which have an effect on the speed; of actions that are not numbered
     [N, 0].
+
+    Args:
+        tensordict: what the environment wrote, batch [N].
+        road: under the ego.
+        actions: their form; None: keep, left and right.
     """
-    vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
-    # beside the lane that it is moving to, not the one it is in
-    legal = stays_on_road(vehicles, constant(SIDES, vehicles.target_lane), road)
     actions = actions or ActionParameters()
+    vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
+    sides = constant(SIDES, vehicles.target_lane)
+    # Beside the lane that it is moving to, not the one it is in.
+    legal = stays_on_road(vehicles, sides, road)
     if not actions.names:
         return legal[:, :0]
     if actions.form == LANE_SPEED:
@@ -240,8 +267,8 @@ class RandomDriver(Driver):
 
     def _uniform(self, tensordict: TensorDictBase) -> Tensor:
         # By counters, not by a generator: an episode draws the same actions in any batch.
-        seed, episode, step = map(tensordict.get, (keys.SEED, keys.EPISODE, keys.STEP))
-        key = episode_key(self.stream, seed, episode)
+        key = episode_key(self.stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
+        step = tensordict.get(keys.STEP)
         return uniform(key, step, 1, [Purpose.RANDOM_ACTION])[:, 0, 0]
 
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
@@ -256,9 +283,10 @@ class RandomLegalDriver(RandomDriver):
         """The r-th legal action, r uniform."""
         legal = legal_actions(tensordict, road_in(tensordict, self.road))
         wanted = (self._uniform(tensordict) * legal.sum(1)).long()
-        # the r-th action that is legal has rank r
+        # The r-th action that is legal has rank r, and so have those behind it that are not.
         rank = legal.cumsum(1) - 1
-        return (legal & (rank == wanted[:, None])).long().argmax(1)
+        is_wanted = legal & (rank == wanted[:, None])
+        return is_wanted.long().argmax(1)
 
 
 class KeepLaneDriver(Driver):
@@ -270,7 +298,13 @@ class KeepLaneDriver(Driver):
 
 
 class MobilDriver(Driver):
-    """The ego driven by MOBIL; with ``politeness_rear=politeness_side=0`` an egoistic one."""
+    """The ego driven by MOBIL; with ``politeness_rear=politeness_side=0`` an egoistic one.
+
+    Args:
+        road, stream: as of every driver.
+        idm: by which it expects vehicles to follow.
+        mobil: its weights and thresholds.
+    """
 
     def __init__(
         self,
@@ -286,24 +320,27 @@ class MobilDriver(Driver):
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
         """MOBIL's wish as an action, in decisions in which a second of simulated time is full."""
         road = road_in(tensordict, self.road)
-        # -1 right, 0 stay, 1 left, of the ego alone
         scene = ego_scene(vehicles, road)
+        # -1 right, 0 stay, 1 left, of the ego alone.
         wish = mobil_wishes(scene, self.idm, self.mobil)[:, 0]
+
         # MOBIL decides once a second; the decisions of the ego may come more often.
         step = tensordict.get(keys.STEP)
         decisions = tensordict.get(keys.EGO).get("decisions")
-        # all decisions take equally many steps, so the last one was at step - step / decisions
+        # All decisions take equally many steps, so the last one was at step - step / decisions.
         last = step - step // decisions.clamp_min(1)
-        due = (decisions == 0) | (step // MOBIL_PERIOD_STEPS != last // MOBIL_PERIOD_STEPS)
+        new_second = step // MOBIL_PERIOD_STEPS != last // MOBIL_PERIOD_STEPS
+        due = (decisions == 0) | new_second
         wish = torch.where(due, wish, 0)
-        return torch.where(wish > 0, LEFT, torch.where(wish < 0, RIGHT, keys.KEEP))
+
+        right_or_keep = torch.where(wish < 0, RIGHT, keys.KEEP)
+        return torch.where(wish > 0, LEFT, right_or_keep)
 
 
 def egoistic_mobil(road: Road, stream: int = Stream.TRAIN) -> MobilDriver:
     """MOBIL with politeness 0."""
-    return MobilDriver(
-        road, stream, mobil=replace(TABLE_IV, politeness_rear=0.0, politeness_side=0.0)
-    )
+    egoistic = replace(TABLE_IV, politeness_rear=0.0, politeness_side=0.0)
+    return MobilDriver(road, stream, mobil=egoistic)
 
 
 #: Name to a constructor from (road, stream).

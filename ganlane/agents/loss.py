@@ -42,7 +42,7 @@ from ganlane.torch_settings import compiled
 
 #: Parameters of a noisy layer.
 _PARAMETERS = ("weight_mu", "weight_sigma", "bias_mu", "bias_sigma")
-#: Of TorchRL's losses.
+#: Of TorchRL's losses: a target network, and a loss per transition, which the agent weights itself.
 _OPTIONS: dict[str, Any] = {
     "delay_value": True,
     "reduction": "none",
@@ -56,6 +56,11 @@ _BETA_2 = 0.999
 class _OfRainbow:
     """What is ours in both losses: a second module with the loss's target parameters, whose noise
     can be drawn anew, and a forward pass on plain tensors, with a mask of the next actions.
+
+    Attributes:
+        network: that learns.
+        target_network: that values the next actions.
+        config: of the agent.
     """
 
     network: QNetwork
@@ -63,71 +68,95 @@ class _OfRainbow:
     config: RainbowConfig
 
     def _attach(self, network: QNetwork, actor: nn.Module) -> None:
-        # update_target does it: TorchRL need not warn that no updater is registered
+        """Give the loss its networks: ``network`` in ``actor``, and a copy with the target's
+        parameters.
+        """
+        # update_target does it: TorchRL need not warn that no updater is registered.
         self._has_update_associated["value_network"] = True  # type: ignore[attr-defined]
+
         actor_copy = deepcopy(actor)
         self.target_value_network_params.to_module(actor_copy)  # type: ignore[attr-defined]
         networks = [module for module in actor_copy.modules() if isinstance(module, QNetwork)]
-        # in __dict__, as TorchRL does with the online module, so that no parameter is listed twice
-        config = network.config.agent
-        self.__dict__.update(network=network, target_network=networks[0], config=config)
-        # losses run deterministic by default; without noise the sigmas would never get a gradient
+
+        # In __dict__, as TorchRL does with the online module, so that no parameter is listed twice.
+        self.__dict__.update(
+            network=network,
+            target_network=networks[0],
+            config=network.config.agent,
+        )
+        # Losses run deterministic by default; without noise the sigmas would never get a gradient.
         self.deterministic_sampling_mode = ExplorationType.RANDOM
 
     @torch.no_grad()
     def update_target(self) -> None:
         """Copy the online parameters to the target network."""
-        # noise is not copied: it is drawn anew before each use
+        # Noise is not copied: it is drawn anew before each use.
         load_parameters(self.target_network, parameters_of(self.network))
 
     def forward(self, batch: TensorDictBase) -> TensorDict:
         """Cross-entropy (C51) per transition; Huber loss without a distribution.
 
-        Reads ``observation`` [B, D], ``action`` [B], ``steps_to_next_obs`` [B, 1] and ``next``'s
-        ``observation``, ``reward`` and ``terminated`` [B, 1]; where ``next`` has ``action_mask``
-        [B, A], the best next action is one that it allows.
-
         Writes ``td_error`` [B, 1], the priority: the Kullback-Leibler divergence (Hessel et al.
         2018), or without ``kl_priority`` the cross-entropy, which is larger by the entropy of the
-        target and is what TorchRL uses; of the Huber loss |error|. Returns ``loss`` [B] and, 0-dim,
-        ``clamped_fraction`` (mass of the targets outside the support) and ``mean_q`` (of the best
-        next action).
+        target and is what TorchRL uses; of the Huber loss |error|.
+
+        Args:
+            batch: with ``observation`` [B, D], ``action`` [B], ``steps_to_next_obs`` [B, 1] and
+                ``next``'s ``observation`` [B, D], ``reward`` and ``terminated`` [B, 1]; where
+                ``next`` has ``action_mask`` [B, A], the best next action is one that it allows.
+
+        Returns:
+            ``loss`` [B] and, 0-dim, ``clamped_fraction`` (mass of the targets outside the support)
+            and ``mean_q`` (of the best next action).
         """
-        network, config = self.network, self.config
-        # the same noise for both observations: the weights are composed once
+        network = self.network
+        config = self.config
+        # The same noise for both observations: the weights are composed once.
         weights = network.weights()
+
+        # What the best next action is worth, by the target network: logits [B, atoms].
         following = batch.get(("next", "observation"))
         with torch.no_grad():
             target_logits = self.target_network.logits(following)
-            # double Q-learning: one network chooses, the other one values
+            # Double Q-learning: one network chooses, the other one values.
             choosing = network.logits(following, weights) if config.double else target_logits
             mask = batch.get(("next", keys.ACTION_MASK), None)
             best, next_action = allowed_values(network.expected(choosing), mask).max(-1)
         valued = pick(target_logits, next_action)
-        logits = pick(network.logits(batch.get("observation"), weights), batch.get("action"))
+
+        # What the online network says of the action that was taken, [B, atoms].
+        all_logits = network.logits(batch.get("observation"), weights)
+        logits = pick(all_logits, batch.get("action"))
+
         if config.distributional:
             returns = bellman(batch, config.gamma, network.support)
             wanted, clamped = project(returns, valued.softmax(-1), network.support)
             loss = -(wanted * logits.log_softmax(-1)).sum(-1)
             priority = loss.detach()
-            # the entropy of the target, the rest of the divergence, is not the network's fault
+            # The entropy of the target, the rest of the divergence, is not the network's fault.
             if config.kl_priority:
-                priority = (priority - torch.special.entr(wanted).sum(-1)).clamp_min(0.0)
+                entropy = torch.special.entr(wanted).sum(-1)
+                priority = (priority - entropy).clamp_min(0.0)
         else:
-            # a single number in place of a distribution; nothing is clamped without a support
+            # A single number in place of a distribution; nothing is clamped without a support.
             wanted = bellman(batch, config.gamma, valued)
             loss = smooth_l1_loss(logits, wanted, reduction="none").squeeze(-1)
             priority = (wanted - logits.detach()).abs().squeeze(-1)
             clamped = torch.zeros_like(best.mean())
+
         batch.set("td_error", priority[:, None])
         return TensorDict({"loss": loss, "clamped_fraction": clamped, "mean_q": best.mean()})
 
 
 class LeanDistributionalLoss(_OfRainbow, DistributionalDQNLoss):
-    """Categorical (C51) loss of a distributional ``network``, by its ``config``."""
+    """Categorical (C51) loss of a distributional ``network``, by its ``config``.
+
+    Bellemare et al. 2017; with ``config.double`` the double one of Rainbow.
+    """
 
     def __init__(self, network: QNetwork) -> None:
-        # TorchRL's actor gives its loss the parameters and keys; the forward above does not call it
+        # TorchRL's actor gives its loss the parameters and keys; the forward above does not call
+        # it.
         actor = DistributionalQValueActor(
             network,
             network.support,
@@ -157,52 +186,76 @@ class LeanDQNLoss(_OfRainbow, DQNLoss):
 
 
 def bellman(batch: TensorDictBase, gamma: float, value: Tensor) -> Tensor:
-    """Return of each transition plus the discounted ``value`` [B, K] or [K] of what follows.
+    """Return of each transition plus the discounted ``value`` of what follows, [B, K].
 
     Nothing follows where it terminated.
+
+    Args:
+        batch: B transitions, with keys as in :class:`LeanDistributionalLoss`.
+        gamma: discount per decision.
+        value: [B, K], or [K] the same for all.
     """
-    # a truncated episode goes on behind its last observation, a terminated one does not
+    # A truncated episode goes on behind its last observation, a terminated one does not.
     alive = 1.0 - batch.get(("next", "terminated")).to(value.dtype)
     discount = gamma ** batch.get("steps_to_next_obs")
-    return batch.get(("next", "reward")).to(value.dtype) + alive * discount * value
+    reward = batch.get(("next", "reward")).to(value.dtype)
+    return reward + alive * discount * value
 
 
 def project(values: Tensor, probabilities: Tensor, support: Tensor) -> tuple[Tensor, Tensor]:
     """Project the distribution with ``probabilities`` at ``values``, [B, K], onto ``support`` [K].
 
-    Returns it, and the mass that is clamped, a mean over the batch, 0-dim.
-
     Values outside the support are clamped to its ends. Each mass is split between its two
     neighbours in proportion to the nearness of the other (Bellemare et al. 2017, equation 7); the
     mean is kept but for the clamping.
+
+    Returns:
+        The probabilities [B, K] at the support, and the mass that is clamped, a mean over the
+        batch, 0-dim.
     """
     low = support[0]
     high = support[-1]
     atoms = support.numel()
-    # where each value falls on the support, in units of its spacing
+
+    # Where each value falls on the support, in units of its spacing.
     place = (values.clamp(low, high) - low) * ((atoms - 1) / (high - low))
-    # the last atom belongs to the interval before it, so that index + 1 exists
+    # The last atom belongs to the interval before it, so that index + 1 exists.
     lower = place.floor().clamp_max(atoms - 2)
+
+    # The upper neighbour gets this share of the mass, the lower one the rest.
     share = (place - lower) * probabilities
     index = lower.long()
     projected = torch.zeros_like(probabilities)
     projected.scatter_add_(1, index, probabilities - share)
     projected.scatter_add_(1, index + 1, share)
-    # counted before the clamping, weighted by probability
+
+    # Counted before the clamping, weighted by probability.
     outside = (values < low) | (values > high)
-    return projected, (probabilities * outside).sum(-1).mean()
+    clamped = (probabilities * outside).sum(-1).mean()
+    return projected, clamped
 
 
 def pick(rows: Tensor, action: Tensor) -> Tensor:
     """Rows [B, K] of ``rows`` [B, A, K] at the actions [B]."""
-    return rows.gather(1, action.view(-1, 1, 1).expand(-1, 1, rows.shape[-1])).squeeze(1)
+    index = action.view(-1, 1, 1).expand(-1, 1, rows.shape[-1])
+    return rows.gather(1, index).squeeze(1)
 
 
 # --- a whole update as one function
 
 
 class Batch(NamedTuple):
-    """Transitions: ``observation``, ``following`` [B, D], ``allowed`` next [B, A], the rest [B]."""
+    """B transitions.
+
+    Attributes:
+        observation, following: before and after, [B, D].
+        action: int64 [B].
+        reward: n-step return, [B].
+        alive: 0 where it terminated, else 1, [B].
+        steps: exponent of the discount of what follows, [B].
+        weight: of its loss, [B].
+        allowed: next actions, bool [B, A].
+    """
 
     observation: Tensor
     action: Tensor
@@ -215,7 +268,15 @@ class Batch(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """What an update gives: ``priority`` [B], the others 0-dim (``loss`` is weighted)."""
+    """What an update gives; 0-dim unless said otherwise.
+
+    Attributes:
+        priority: of the transitions, [B].
+        loss: weighted mean over the batch.
+        mean_q: mean value of the best next actions.
+        clamped_fraction: mass of the targets outside the support.
+        gradient_norm: before the clipping.
+    """
 
     priority: Tensor
     loss: Tensor
@@ -225,7 +286,13 @@ class Learned(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """What does not change during a training."""
+    """What does not change during a training.
+
+    Attributes:
+        gamma: discount per decision.
+        gradient_clip: largest norm of the gradient of all parameters.
+        adam_eps: Adam's epsilon.
+    """
 
     gamma: float
     gradient_clip: float
@@ -233,41 +300,56 @@ class Settings(NamedTuple):
 
 
 def composed_layers(
-    parameters: list[Tensor], noise: Sequence[Sequence[Tensor]], actions: int
+    parameters: list[Tensor],
+    noise: Sequence[Sequence[Tensor]],
+    actions: int,
 ) -> Weights:
     """Weight and bias of every layer of a network (Fortunato et al. 2017), the duel folded into the
     last.
+
+    Args:
+        parameters: four per layer.
+        noise: of each layer's inputs and outputs.
+        actions: A.
     """
     layers = []
     for i, (inputs, outputs) in enumerate(noise):
-        # four parameters for each layer, in the order of _PARAMETERS
+        # Four parameters for each layer, in the order of _PARAMETERS.
         weight_mu, weight_sigma, bias_mu, bias_sigma = parameters[4 * i : 4 * i + 4]
-        # factorised noise: the outer product of one vector per side
+        # Factorised noise: the outer product of one vector per side.
         weight = weight_mu + weight_sigma * torch.outer(outputs, inputs)
-        layers.append((weight, bias_mu + bias_sigma * outputs))
+        bias = bias_mu + bias_sigma * outputs
+        layers.append((weight, bias))
+
     weight, bias = layers.pop()
-    return [*layers, (folded(weight, actions), folded(bias, actions))]
+    head = (folded(weight, actions), folded(bias, actions))
+    return [*layers, head]
 
 
 def folded(part: Tensor, actions: int) -> Tensor:
     """The head's weight [(1 + A) K, H] or bias [(1 + A) K] with the duel in it: [A K, ...]."""
-    # Q_a = V + A_a - mean(A), row by row of the weights
     rows = part.unflatten(0, (1 + actions, -1))
-    return (rows[:1] + rows[1:] - rows[1:].mean(0, keepdim=True)).flatten(0, 1)
+    of_value = rows[:1]
+    of_advantages = rows[1:]
+    # Q_a = V + A_a - mean(A), row by row of the weights.
+    of_actions = of_value + of_advantages - of_advantages.mean(0, keepdim=True)
+    return of_actions.flatten(0, 1)
 
 
 def unfolded(gradient: Tensor, actions: int) -> Tensor:
     """Gradient of the head from that of the folded head: the transpose of :func:`folded`."""
-    # V gets the sum of all, each A_a its own less the mean
+    # V gets the sum of all, each A_a its own less the mean.
     rows = gradient.unflatten(0, (actions, -1))
-    of_value, of_advantages = rows.sum(0, keepdim=True), rows - rows.mean(0, keepdim=True)
+    of_value = rows.sum(0, keepdim=True)
+    of_advantages = rows - rows.mean(0, keepdim=True)
     return torch.cat((of_value, of_advantages)).flatten(0, 1)
 
 
 def forward(layers: Weights, x: Tensor) -> list[Tensor]:
-    """The input of every layer, and the output of the last."""
+    """The input of every layer, and the output of the last, for observations ``x`` [B, D]."""
     inputs = [x]
     for number, (weight, bias) in enumerate(layers):
+        # After every layer but the last.
         relu = number < len(layers) - 1
         inputs.append(matrix_product(inputs[-1], weight, bias, relu))
     return inputs
@@ -280,29 +362,39 @@ def gradients(
     of_logits: Tensor,
     actions: int,
 ) -> list[Tensor]:
-    """Of all parameters, in the layers' order, from that of the folded head's output [B, A K]."""
+    """Of all parameters, four per layer, in the layers' order.
+
+    Args:
+        layers: of :func:`composed_layers`.
+        noise: of each layer's inputs and outputs.
+        inputs: of every layer, [B, ...] each.
+        of_logits: gradient of the folded head's output, [B, A K].
+        actions: A.
+    """
     all_gradients: list[Tensor] = []
-    # from the last layer to the first, by the chain rule
+    # From the last layer to the first, by the chain rule: ``behind`` is the gradient of the
+    # layer's output.
     behind = of_logits
     for number in reversed(range(len(layers))):
-        # for each layer: the gradient by its weights, then by its inputs
+        # First the gradient of the layer's weights.
         of_weight = matrix_product(behind.t(), inputs[number].t())
         of_bias = behind.sum(0)
-        # of the folded head's rows, those of value and advantages
+        # Of the folded head's rows, those of value and advantages.
         if number == len(layers) - 1:
             of_weight = unfolded(of_weight, actions)
             of_bias = unfolded(of_bias, actions)
+
         # A weight is mu + sigma * noise, so the gradient of sigma is the weight's times the noise.
         noise_in, noise_out = noise[number]
-        all_gradients = [
-            of_weight,
-            of_weight * torch.outer(noise_out, noise_in),
-            of_bias,
-            of_bias * noise_out,
-            *all_gradients,
-        ]
-        if number:  # back through the layer's weight and the ReLU before it
-            product = matrix_product(behind, layers[number][0].t())
+        of_weight_sigma = of_weight * torch.outer(noise_out, noise_in)
+        of_bias_sigma = of_bias * noise_out
+        # In the order of _PARAMETERS, before those of the layers behind.
+        all_gradients = [of_weight, of_weight_sigma, of_bias, of_bias_sigma, *all_gradients]
+
+        # Then that of its inputs: back through the weight and the ReLU before it.
+        if number:
+            weight, _ = layers[number]
+            product = matrix_product(behind, weight.t())
             behind = torch.where(inputs[number] > 0, product, 0.0)
     return all_gradients
 
@@ -335,43 +427,64 @@ def update(
     rows, actions = batch.allowed.shape
     layers = composed_layers(online, noise, actions)
     target_layers = composed_layers(target, target_noise, actions)
-    # the online network sees both observations in one product
+
+    # The online network sees both observations in one product: logits [2 B, A, K].
     inputs = forward(layers, torch.cat((batch.observation, batch.following)))
     logits = inputs.pop().unflatten(-1, (actions, -1))
+    logits_before = logits[:rows]
+    logits_after = logits[rows:]
 
-    # the targets: the online network chooses the next action, the target network values it
-    best, chosen = allowed_values(logits[rows:].softmax(-1) @ support, batch.allowed).max(-1)
+    # The targets: the online network chooses the next action, the target network values it.
+    next_values = allowed_values(logits_after.softmax(-1) @ support, batch.allowed)
+    best, chosen = next_values.max(-1)
     target_logits = forward(target_layers, batch.following)[-1].unflatten(-1, (actions, -1))
+    probabilities = pick(target_logits, chosen).softmax(-1)
     discount = torch.pow(settings.gamma, batch.steps)
-    values = batch.reward[:, None] + (batch.alive * discount)[:, None] * support
-    wanted, clamped = project(values, pick(target_logits, chosen).softmax(-1), support)
-    # the loss is the cross-entropy, the priority its excess over the target's entropy
-    log_p = pick(logits[:rows], batch.action).log_softmax(-1)
-    loss = -(wanted * log_p).sum(-1)
-    priority = (loss - torch.special.entr(wanted).sum(-1)).clamp_min(0.0)
+    returns = batch.reward[:, None] + (batch.alive * discount)[:, None] * support
+    wanted, clamped = project(returns, probabilities, support)
 
-    # the gradient of the weighted mean of the losses, first by the logits of the taken actions
+    # The loss is the cross-entropy, the priority its excess over the target's entropy.
+    log_p = pick(logits_before, batch.action).log_softmax(-1)
+    loss = -(wanted * log_p).sum(-1)
+    entropy = torch.special.entr(wanted).sum(-1)
+    priority = (loss - entropy).clamp_min(0.0)
+
+    # The gradient of the weighted mean of the losses, first by the logits of the taken actions.
     # Divided by the number of rows, as in Rainbow, not by the sum of the weights.
     share = (batch.weight / rows)[:, None]
     of_taken = (log_p.exp() * wanted.sum(-1, keepdim=True) - wanted) * share
+    # Those of the other actions have none: [B, A, K], then [B, A K].
     is_taken = batch.action[:, None] == torch.arange(actions, device=support.device)
     of_logits = torch.where(is_taken[..., None], of_taken[:, None, :], 0.0).flatten(1)
-    by_parameter = gradients(layers, noise, [x[:rows] for x in inputs], of_logits, actions)
+    inputs_before = [x[:rows] for x in inputs]
+    by_parameter = gradients(layers, noise, inputs_before, of_logits, actions)
 
-    # clipping as by clip_grad_norm_, then Adam
-    norm = torch.stack([(gradient * gradient).sum() for gradient in by_parameter]).sum().sqrt()
+    # Clipping as by clip_grad_norm_.
+    squares = [(gradient * gradient).sum() for gradient in by_parameter]
+    norm = torch.stack(squares).sum().sqrt()
     scale = (settings.gradient_clip / (norm + 1e-6)).clamp_max(1.0)
+
+    # Adam, on the tensors of the networks and of the optimiser themselves.
     for parameter, gradient, first, second in zip(online, by_parameter, mean, square):
         clipped = gradient * scale
         first.lerp_(clipped, 1.0 - _BETA_1)
         second.mul_(_BETA_2).addcmul_(clipped, clipped, value=1.0 - _BETA_2)
-        step = first * corrections[0] / ((second * corrections[1]).sqrt() + settings.adam_eps)
+        deviation = (second * corrections[1]).sqrt()
+        step = first * corrections[0] / (deviation + settings.adam_eps)
         parameter.sub_(rate * step)
-    return Learned(priority, (batch.weight * loss).mean(), best.mean(), clamped, norm)
+
+    weighted_loss = (batch.weight * loss).mean()
+    return Learned(priority, weighted_loss, best.mean(), clamped, norm)
 
 
 class UpdateGraph:
-    """The compiled :func:`update` of an agent, on the tensors of its networks and its optimiser."""
+    """The compiled :func:`update` of an agent, on the tensors of its networks and its optimiser.
+
+    Args:
+        network, target: with all six components of Rainbow, on a CPU.
+        optimizer: of the parameters of ``network``; its state is made and changed here.
+        config: of the agent.
+    """
 
     def __init__(
         self,
@@ -395,13 +508,16 @@ class UpdateGraph:
         """
         online = _parameters_of(self.network)
         target = _parameters_of(self.target)
-        # Adam's own state, so that a run can change to the other way and back
+
+        # Adam's own state, so that a run can change to the other way and back.
         moments = [self._moments(parameter) for parameter in online]
         # All parameters have made equally many steps, so the first one's count is that of all.
         step = float(moments[0]["step"]) + 1.0
         for state in moments:
             state["step"].fill_(step)
+        corrections = [1.0 / (1.0 - _BETA_1**step), 1.0 / (1.0 - _BETA_2**step)]
         (group,) = self.optimizer.param_groups
+
         return self.update(
             self.settings,
             self.network.support,
@@ -412,9 +528,9 @@ class UpdateGraph:
             noise_of(self.network, generator),
             noise_of(self.target, generator),
             self._batch(batch),
-            # a tensor: a number would be a constant of the graph, compiled anew at each change
+            # Tensors: a number would be a constant of the graph, compiled anew at each change.
             torch.tensor(float(group["lr"])),
-            torch.tensor([1.0 / (1.0 - _BETA_1**step), 1.0 / (1.0 - _BETA_2**step)]),
+            torch.tensor(corrections),
         )
 
     def _batch(self, batch: TensorDictBase) -> Batch:
@@ -423,16 +539,17 @@ class UpdateGraph:
         following = batch.get("next")
         allowed = following.get(keys.ACTION_MASK, None)
         if allowed is None:
-            allowed = torch.ones((len(action), self.network.config.actions), dtype=torch.bool)
+            shape = (len(action), self.network.config.actions)
+            allowed = torch.ones(shape, dtype=torch.bool)
         return Batch(
-            batch.get("observation"),
-            action,
-            following.get("reward")[:, 0],
-            following.get("observation"),
-            (~following.get("terminated")[:, 0]).float(),
-            batch.get("steps_to_next_obs")[:, 0].float(),
-            batch.get("priority_weight"),
-            allowed,
+            observation=batch.get("observation"),
+            action=action,
+            reward=following.get("reward")[:, 0],
+            following=following.get("observation"),
+            alive=(~following.get("terminated")[:, 0]).float(),
+            steps=batch.get("steps_to_next_obs")[:, 0].float(),
+            weight=batch.get("priority_weight"),
+            allowed=allowed,
         )
 
     def _moments(self, parameter: Tensor) -> dict[str, Any]:

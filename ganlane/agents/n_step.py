@@ -16,10 +16,16 @@ from ganlane import keys
 
 
 class Step(NamedTuple):
-    """One decision of N environments; ``following`` is the observation after it, before any reset.
+    """One decision of N environments.
 
-    ``following_mask`` [N, A] bool says which actions are allowed there, where the environment has a
-    mask.
+    Attributes:
+        observation: before it, [N, D].
+        action: [N].
+        reward: [N, 1].
+        following: the observation after it, before any reset, [N, D].
+        terminated, done: bool [N, 1].
+        following_mask: which actions are allowed after it, bool [N, A]; None where the environment
+            has no mask.
     """
 
     observation: Tensor
@@ -28,7 +34,6 @@ class Step(NamedTuple):
     following: Tensor
     terminated: Tensor
     done: Tensor
-    # None where the environment has no mask.
     following_mask: Tensor | None = None
 
     @classmethod
@@ -49,6 +54,10 @@ class NStepWindow:
     return ends at the first ``done`` among its n steps, and so do its next observation and its
     ``terminated``: a truncated episode bootstraps from its true last observation, a terminated one
     not at all.
+
+    Args:
+        n: steps per transition.
+        gamma: discount per decision.
     """
 
     def __init__(self, n: int, gamma: float) -> None:
@@ -69,28 +78,33 @@ class NStepWindow:
             discount), and ``next``'s ``observation``, ``reward`` (the n-step return),
             ``terminated``, and ``action_mask`` where there is one.
         """
-        # the oldest step is complete once there are n
+        # The oldest step is complete once there are n.
         self.steps.append(Step.copied(step))
         if len(self.steps) < self.n:
             return None
-        # The oldest step gets its transition now and is not needed again. Rewards of later steps
-        # are added as long as no episode has ended in between.
+
+        # It gets its transition now and is not needed again. Rewards of later steps are added as
+        # long as no episode has ended in between.
         first = self.steps.pop(0)
-        reward, following, terminated = first.reward, first.following, first.terminated
+        reward = first.reward
+        following = first.following
         mask = first.following_mask
+        terminated = first.terminated
         # Number of decisions whose rewards are summed, [N, 1].
         length = torch.ones_like(reward)
+
+        # Where no episode has ended between the oldest step and the one at hand, [N, 1].
         running = ~first.done
         for power, after in enumerate(self.steps, start=1):
-            # ``running``: no episode has ended between the oldest step and this one
             reward = reward + running * (self.gamma**power * after.reward)
-            # what follows is the end of the last step that still belongs to it
+            # What follows is the end of the last step that still belongs to it.
             following = torch.where(running, after.following, following)
             if mask is not None and after.following_mask is not None:
                 mask = torch.where(running, after.following_mask, mask)
             terminated = torch.where(running, after.terminated, terminated)
             length = length + running
             running = running & ~after.done
+
         size = reward.shape[:1]
         end = {"observation": following, "reward": reward, "terminated": terminated}
         if mask is not None:

@@ -33,7 +33,12 @@ LARGEST = 65536
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """A network for observations of size D and A actions; ``agent`` gives the rest (:data:`SHAPE`).
+    """The form of a network.
+
+    Attributes:
+        agent: gives layers, noise and distribution (:data:`SHAPE`).
+        observation_size: D.
+        actions: A.
 
     Raises:
         UserError: a layer would be empty or too large.
@@ -49,7 +54,8 @@ class NetworkConfig:
             "actions": self.actions,
             "atoms": self.agent.atoms,
         }
-        sizes |= {f"hidden[{i}]": width for i, width in enumerate(self.agent.hidden)}
+        for i, width in enumerate(self.agent.hidden):
+            sizes[f"hidden[{i}]"] = width
         for name, size in sizes.items():
             if type(size) is not int or not 1 <= size <= LARGEST:
                 raise UserError(
@@ -79,7 +85,7 @@ class NetworkConfig:
         expected_names = ("actions", "observation_size", *SHAPE)
         if description.keys() != {*expected_names}:
             raise UserError(f"expected the entries {', '.join(expected_names)}")
-        # the record checks the types of the values
+        # The record checks the types of the values.
         options = RainbowConfig(**{name: description[name] for name in SHAPE})
         return cls(options, description["observation_size"], description["actions"])
 
@@ -89,6 +95,11 @@ class QNetwork(nn.Module):
 
     Noise is added under ``ExplorationType.RANDOM`` alone, and is the same until
     :func:`redraw_noise`.
+
+    Attributes:
+        support: returns that the atoms stand for, [atoms].
+        trunk: the hidden layers.
+        head: the last layer, [(1 +) A atoms] outputs.
     """
 
     support: Tensor
@@ -98,10 +109,13 @@ class QNetwork(nn.Module):
         self.config = config
         options = config.agent
         layer = partial(NoisyLinear, std_init=options.noisy_sigma) if options.noisy else nn.Linear
+
         widths = (config.observation_size, *options.hidden)
         self.trunk = nn.ModuleList(layer(*pair) for pair in pairwise(widths))
-        # a dueling head has one row more, the value
-        self.head = layer(widths[-1], (config.actions + options.dueling) * config.outputs)
+        # A dueling head has one row more, the value.
+        rows = config.actions + options.dueling
+        self.head = layer(widths[-1], rows * config.outputs)
+
         support = torch.linspace(options.v_min, options.v_max, options.atoms)
         # Not persistent: an agent's file has the bounds of the support in its description.
         self.register_buffer("support", support, persistent=False)
@@ -111,15 +125,16 @@ class QNetwork(nn.Module):
         return [(layer.weight, layer.bias) for layer in (*self.trunk, self.head)]
 
     def logits(self, observation: Tensor, weights: Weights | None = None) -> Tensor:
-        """Unnormalised output [*, A, atoms] (atoms is 1 when not distributional) for observations
-        [*, D].
+        """Unnormalised output [*, A, atoms]; atoms is 1 when not distributional.
 
-        ``weights`` of :meth:`weights` save composing them again when several batches see the same
-        noise.
+        Args:
+            observation: [*, D], of any float type.
+            weights: of :meth:`weights`; they save composing them again when several batches see
+                the same noise. None: with the noise at this moment.
         """
-        # each layer's weights are composed with the noise at this moment
-        *hidden_layers, head = self.weights() if weights is None else weights
-        # observations may come in another precision
+        if weights is None:
+            weights = self.weights()
+        *hidden_layers, head = weights
         hidden = observation.to(self.support.dtype)
         for weight, bias in hidden_layers:
             hidden = linear(hidden, weight, bias, relu=True)
@@ -139,7 +154,7 @@ class QNetwork(nn.Module):
         return logits.squeeze(-1)
 
     def expected(self, logits: Tensor) -> Tensor:
-        """Action values [*, A] of the ``logits`` [*, A, atoms]."""
+        """Action values [*, A] of the ``logits`` [*, A, atoms]: the means of the distributions."""
         if self.config.agent.distributional:
             return logits.softmax(-1) @ self.support
         return logits.squeeze(-1)
@@ -159,11 +174,11 @@ def allowed_values(values: Tensor, mask: Tensor | None) -> Tensor:
 
 def duel(rows: Tensor) -> Tensor:
     """Join value (row 0) and advantages (the rest) of [*, 1 + A, atoms] into [*, A, atoms] (Wang et
-    al. 2016).
+    al. 2016, equation 9).
     """
     value = rows[..., :1, :]
-    # Without the mean taken off, value and advantages could shift against each other.
     advantage = rows[..., 1:, :]
+    # Without the mean taken off, value and advantages could shift against each other.
     return value + advantage - advantage.mean(-2, keepdim=True)
 
 
@@ -180,7 +195,8 @@ def load_parameters(network: QNetwork, weights: Mapping[str, Tensor]) -> None:
         UserError: names or shapes differ.
     """
     parameters = dict(network.named_parameters())
-    # names and shapes first: nothing is copied where one of them differs
+
+    # Names and shapes first: nothing is copied where one of them differs.
     expected = {name: tuple(value.shape) for name, value in parameters.items()}
     shapes = {name: tuple(value.shape) for name, value in weights.items()}
     for name in sorted(expected.keys() | shapes.keys()):
@@ -190,6 +206,7 @@ def load_parameters(network: QNetwork, weights: Mapping[str, Tensor]) -> None:
                 f"the checkpoint and {expected.get(name, 'absent')} in the network; use the "
                 "observation and agent options it was trained with."
             )
+
     for name, parameter in parameters.items():
         parameter.copy_(weights[name])
 
@@ -201,8 +218,9 @@ def redraw_noise(network: nn.Module, generator: torch.Generator) -> None:
     In place of TorchRL's ``reset_noise``, which draws from the global generator; one draw serves
     all layers.
     """
-    for layer, (inputs, outputs) in zip(noisy_layers(network), noise_of(network, generator)):
-        # in place: the layer's buffers, which its forward adds
+    noise = noise_of(network, generator)
+    for layer, (inputs, outputs) in zip(noisy_layers(network), noise):
+        # In place: the layer's buffers, which its forward adds.
         torch.outer(outputs, inputs, out=layer.weight_epsilon)
         layer.bias_epsilon.copy_(outputs)
 
@@ -212,12 +230,17 @@ def noise_of(network: nn.Module, generator: torch.Generator) -> list[tuple[Tenso
     layers = noisy_layers(network)
     if not layers:
         return []
-    # one draw for all layers, which is faster than one for each
-    sizes = [size for layer in layers for size in (layer.in_features, layer.out_features)]
+    # Inputs of the first layer, its outputs, inputs of the second one, and so on.
+    sizes: list[int] = []
+    for layer in layers:
+        sizes += [layer.in_features, layer.out_features]
+
+    # One draw for all layers, which is faster than one for each.
     normal = torch.randn(sum(sizes), generator=generator, device=generator.device)
     # f(x) = sgn(x) sqrt(|x|), equation 11 of Fortunato et al.
-    noise = (normal.sign() * normal.abs().sqrt()).split(sizes)
-    return list(zip(noise[::2], noise[1::2]))
+    noise = normal.sign() * normal.abs().sqrt()
+    parts = noise.split(sizes)
+    return list(zip(parts[::2], parts[1::2]))
 
 
 def noisy_layers(network: nn.Module) -> list[NoisyLinear]:

@@ -41,6 +41,15 @@ class Rainbow:
         compile: whether an update runs as one compiled graph
             (:class:`ganlane.agents.loss.UpdateGraph`), where that can do what ``config`` says; the
             same up to rounding, and faster on a CPU.
+
+    Attributes:
+        network, target: the online network, which learns, and the one that values.
+        policy, greedy: exploring, to collect, and without exploration.
+        updates: since the start of the training.
+        graph: the compiled update; None: it is computed step by step.
+
+    Raises:
+        ParameterError: a learning rate falls, and it is not said within how many decisions.
     """
 
     def __init__(
@@ -65,7 +74,8 @@ class Rainbow:
             name: torch.Generator(self.device).manual_seed(seed * 3 + i)
             for i, name in enumerate(("collect", "learn", "replay"))
         }
-        # layers draw their initial weights from the global generator
+
+        # Layers draw their initial weights from the global generator, which is put back.
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
             network = QNetwork(NetworkConfig(config, observation_size, actions))
@@ -73,24 +83,32 @@ class Rainbow:
         loss = LeanDistributionalLoss if config.distributional else LeanDQNLoss
         self.loss = loss(self.network)
         self.target = self.loss.target_network
-        # Rainbow's 1.5e-4 is 0.005 over its batch of 32
-        adam_eps = 0.005 / config.batch_size if config.adam_eps is None else config.adam_eps
+
+        adam_eps = config.adam_eps
+        if adam_eps is None:
+            # Rainbow's 1.5e-4 is 0.005 over its batch of 32.
+            adam_eps = 0.005 / config.batch_size
         self.optimizer = torch.optim.Adam(
-            self.network.parameters(), lr=config.learning_rate, eps=adam_eps, fused=True
+            self.network.parameters(),
+            lr=config.learning_rate,
+            eps=adam_eps,
+            fused=True,
         )
-        # which draws from a generator of its own
         self.replay = make_replay(config, self.generators["replay"])
-        # one network, two ways to drive with it
+
+        # One network, two ways to drive with it.
         self.policy = ExploringPolicy(self.network, self.generators["collect"], legal)
         self.greedy = GreedyPolicy(self.network)
-        # since the start of the training
-        self.updates = 0
-        self.graph: UpdateGraph | None = None
+
         # The graph is of the whole of Rainbow; with any part left out the update is computed step
         # by step.
         parts = ("distributional", "double", "dueling", "noisy", "prioritised", "kl_priority")
-        if compile and all(getattr(config, part) for part in parts) and self.device.type == "cpu":
+        is_whole = all(getattr(config, part) for part in parts)
+        self.graph: UpdateGraph | None = None
+        if compile and is_whole and self.device.type == "cpu":
             self.graph = UpdateGraph(self.network, self.target, self.optimizer, config)
+
+        self.updates = 0
         self.anneal(0)
 
     @property
@@ -102,7 +120,10 @@ class Rainbow:
         """Set the share of random actions and the learning rate after ``decisions``."""
         config = self.config
         self.policy.epsilon = annealed(
-            config.epsilon_start, config.epsilon, decisions, config.epsilon_decisions
+            config.epsilon_start,
+            config.epsilon,
+            decisions,
+            config.epsilon_decisions,
         )
         if config.learning_rate_end is not None:
             (group,) = self.optimizer.param_groups
@@ -119,43 +140,55 @@ class Rainbow:
             self.replay.extend(transition, update_priority=False)
 
     def update(self) -> dict[str, Tensor]:
-        """One step of gradient descent; gives 0-dim tensors to log, still on the device."""
+        """One step of gradient descent on a batch from the replay buffer.
+
+        Returns:
+            0-dim tensors to log, still on the device: the fields of
+            :class:`~ganlane.agents.loss.Learned`, of the priorities their mean.
+        """
         config = self.config
         if config.prioritised:
+            # The weights make up for the priorities more and more, at the end in full.
             beta = annealed(config.beta_start, 1.0, self.updates, config.beta_updates)
             self.replay.sampler.beta = beta
-        # one batch by priority
         batch = self.replay.sample()
+
+        # Both change the same parameters and the same state of Adam.
         descend = self._descend if self.graph is None else self.graph
-        # both change the same parameters and the same state of Adam
         learned = descend(batch, self.generators["learn"])
+
         # Only what was drawn gets a new priority; the rest keeps its own until it is drawn.
         if config.prioritised:
             self.replay.sampler.update_priority(batch.get("index"), learned.priority)
+
         self.updates += 1
-        # a hard copy, as in Rainbow
+        # A hard copy, as in Rainbow.
         if self.updates % config.target_period == 0:
             self.loss.update_target()
         return {**learned._asdict(), "priority": learned.priority.mean()}
 
     def _descend(self, batch: TensorDict, generator: torch.Generator) -> Learned:
         """What :class:`~ganlane.agents.loss.UpdateGraph` does, for every ``config`` and device."""
-        # both networks get new noise for every update
-        for module in (self.network, self.target):
-            redraw_noise(module, generator)
+        # Both networks get new noise for every update.
+        redraw_noise(self.network, generator)
+        redraw_noise(self.target, generator)
+
         terms = self.loss(batch)
+        # Without priorities all weigh the same.
+        weight = batch.get("priority_weight", 1.0)
         # Rainbow's mean of w * loss; TorchRL's own 'mean' divides by the sum of the weights.
-        objective = (batch.get("priority_weight", 1.0) * terms["loss"]).mean()
+        objective = (weight * terms["loss"]).mean()
+
         self.optimizer.zero_grad(set_to_none=True)
         objective.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         self.optimizer.step()
         return Learned(
-            batch.get("td_error")[:, 0],
-            objective.detach(),
-            terms["mean_q"],
-            terms["clamped_fraction"],
-            norm,
+            priority=batch.get("td_error")[:, 0],
+            loss=objective.detach(),
+            mean_q=terms["mean_q"],
+            clamped_fraction=terms["clamped_fraction"],
+            gradient_norm=norm,
         )
 
     def sigma(self) -> Tensor:
@@ -163,9 +196,11 @@ class Rainbow:
 
         0 without noise.
         """
-        # of the weights alone: those of the biases are few
+        # Of the weights alone: those of the biases are few.
         sigmas = [layer.weight_sigma.detach().abs().mean() for layer in noisy_layers(self.network)]
-        return torch.stack(sigmas).mean() if sigmas else torch.zeros(())
+        if not sigmas:
+            return torch.zeros(())
+        return torch.stack(sigmas).mean()
 
     def weights(self) -> dict[str, Tensor]:
         """The online network's parameters, without its momentary noise."""
@@ -183,10 +218,11 @@ class Rainbow:
         Without the buffer a resume is not exact anyway, so Adam's moments are kept in bfloat16.
         """
         optimizer = self.optimizer.state_dict()
-        if not with_replay:  # loading brings the moments back to the weights' type
-            # new dictionaries: those of the optimiser are its own
+        if not with_replay:
             for row, moments in optimizer["state"].items():
+                # Loading brings the moments back to the weights' type.
                 halves = {name: moments[name].bfloat16() for name in ("exp_avg", "exp_avg_sq")}
+                # A new dictionary: this one is the optimiser's own.
                 optimizer["state"][row] = {**moments, **halves}
         return {
             "config": asdict(self.config),
@@ -216,21 +252,26 @@ class Rainbow:
                     f"agent.{name}={value}: the saved agent has {saved}; give the same to go on "
                     "from it."
                 )
-        # in place: policies, losses and optimiser keep their references
+
+        # In place: policies, losses and optimiser keep their references.
         load_parameters(self.network, state["network"])
         load_parameters(self.target, state["target"])
+
+        # Adam would write beyond moments that are too short; before the first update there are
+        # none.
         moments = state["optimizer"]["state"]
-        # Adam would write beyond moments that are too short.
         shapes = [parameter.shape for parameter in self.network.parameters()]
         for name in ("exp_avg", "exp_avg_sq"):
             if moments and [moments[row][name].shape for row in moments] != shapes:
                 raise ValueError("the optimiser's moments are of other weights")
         # Learning rate and eps stay those of this run.
         self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
+
         for name, generator in self.generators.items():
             generator.set_state(state["generators"][name].cpu())
         self.updates = state["updates"]
-        # without the buffer in the state it is filled again by the run
+
+        # Without the buffer in the state it is filled again by the run.
         self.replay.empty()
         if state["replay"] is not None:
             load_replay_state(self.replay, state["replay"])
@@ -238,4 +279,7 @@ class Rainbow:
 
 def annealed(start: float, end: float, done: int, total: int) -> float:
     """From ``start`` to ``end`` in a straight line over ``total``, then ``end``."""
-    return end if done >= total else start + (end - start) * done / total
+    # A total of 0 is over at once.
+    if done >= total:
+        return end
+    return start + (end - start) * done / total

@@ -39,14 +39,16 @@ ROW = 64
 
 
 def make_replay(config: RainbowConfig, generator: torch.Generator) -> TensorDictReplayBuffer:
-    """The replay buffer that ``config`` asks for, on the generator's device."""
-    capacity = config.capacity
+    """The replay buffer that ``config`` asks for, on the generator's device.
+
+    All that it draws comes from ``generator``.
+    """
     device = generator.device
     sampler = RandomSampler()
     if config.prioritised:
-        sampler = RowSampler(capacity, config.alpha, config.beta_start, device)
+        sampler = RowSampler(config.capacity, config.alpha, config.beta_start, device)
     return TensorDictReplayBuffer(
-        storage=LazyTensorStorage(capacity, device=device),
+        storage=LazyTensorStorage(config.capacity, device=device),
         sampler=sampler,
         batch_size=config.batch_size,
         generator=generator,
@@ -56,12 +58,16 @@ def make_replay(config: RainbowConfig, generator: torch.Generator) -> TensorDict
 
 def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
     """Plain data: the transitions in use (by dotted key), the place of the next, the sampler."""
-    # in the order of the storage, so that the indices of the sampler hold
+    # In the order of the storage, so that the indices of the sampler hold.
     rows = buffer[:] if len(buffer) else TensorDict({}, [0])
-    tensors = dict(rows.select(*TRANSITION_KEYS, strict=False).flatten_keys(".").items())
-    # a view would be saved with all of the storage behind it
+    # The mask of the next actions may be missing.
+    rows = rows.select(*TRANSITION_KEYS, strict=False)
+    tensors = dict(rows.flatten_keys(".").items())
+
+    # A view would be saved with all of the storage behind it.
     if len(buffer) < buffer.storage.max_size:
         tensors = {name: tensor.clone() for name, tensor in tensors.items()}
+
     return {
         "rows": tensors,
         "cursor": buffer.writer._cursor,
@@ -73,9 +79,13 @@ def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
 def load_replay_state(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> None:
     """Restore :func:`replay_state` into a buffer of the same capacity."""
     buffer.empty()
-    if state["rows"]:
-        buffer.extend(TensorDict(state["rows"], [len(state["rows"]["action"])]).unflatten_keys("."))
-    # extend has moved the cursor; after a wrap it stands elsewhere
+    tensors = state["rows"]
+    if tensors:
+        rows = TensorDict(tensors, [len(tensors["action"])])
+        buffer.extend(rows.unflatten_keys("."))
+
+    # extend() has moved the cursor to the end of the rows; once the buffer has been full, it
+    # stands anywhere among them.
     buffer.writer._cursor = state["cursor"]
     buffer.writer._write_count = state["writes"]
     buffer.sampler.load_state_dict(state["sampler"])
@@ -89,10 +99,20 @@ class RowSampler(PrioritizedSampler):
     outlier that is hardly ever drawn, and would shrink every step. New items get the largest
     priority seen. Draws come from the generator of the replay buffer (``generator=`` at its
     construction) and from no other.
+
+    Priorities lie in rows of :data:`ROW`, whose sums are kept: a draw looks for a row by these
+    sums, and then for an item in the row, instead of summing up all priorities.
+
+    Args:
+        max_capacity: of the buffer.
+        alpha: exponent of the priorities.
+        beta: exponent of the weights; the agent anneals it.
+        device: of the priorities.
     """
 
     def __init__(self, max_capacity: int, alpha: float, beta: float, device: torch.device) -> None:
-        # not the parent's constructor: it warns of a missing C++ extension, not needed here
+        # Not the parent's constructor: it warns of a missing C++ extension, not needed here. These
+        # are the attributes that the parent's methods read.
         self._max_capacity = max_capacity
         self._alpha = alpha
         self._beta = beta
@@ -104,10 +124,12 @@ class RowSampler(PrioritizedSampler):
         self._init()
 
     def _init(self) -> None:
-        # rounded up
+        # Rounded up.
         rows = -(-self._max_capacity // ROW)
+        # ``(p_i + 1e-8)^alpha`` of every item; 0 where there is none.
         self.priorities = torch.zeros(rows, ROW, device=self._device)
         self.row_sums = torch.zeros(rows, dtype=torch.float64, device=self._device)
+        # The largest p_i seen, at least 1.
         self.largest = torch.ones((), device=self._device)
 
     @property
@@ -124,44 +146,65 @@ class RowSampler(PrioritizedSampler):
     def update_priority(
         self, index: Tensor | int, priority: Tensor | float, *, storage: Storage | None = None
     ) -> None:
-        """Give the items at ``index`` [B] raw priorities of at least 0: [B], [B, 1] or a number."""
+        """Give items new priorities.
+
+        Args:
+            index: of the items, [B].
+            priority: raw, at least 0: [B], [B, 1] or a number for all.
+            storage: not read; TorchRL passes it.
+        """
         index = torch.as_tensor(index, device=self.device).reshape(-1)
         priority = torch.as_tensor(priority, dtype=torch.float32, device=self.device).reshape(-1)
         self.largest = torch.maximum(self.largest, priority.amax())
         raised = (priority + self._eps) ** self._alpha
         self.priorities.view(-1)[index] = raised.expand(index.shape)
-        # whole rows are summed anew, so that rounding errors do not add up
+
+        # Whole rows are summed anew, so that rounding errors do not add up.
         row = index // ROW
         self.row_sums[row] = self.priorities[row].sum(-1, dtype=torch.float64)
 
     @torch.no_grad()
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Indices [B] and ``priority_weight`` [B], in (0, 1]."""
+        """Indices [B] and ``priority_weight`` [B], in (0, 1].
+
+        Raises:
+            UserError: a priority is not finite (checked on a CPU only).
+        """
         # In double precision, since the sums run over all priorities.
         cumulated = self.row_sums.cumsum(0)
-        # reading it would make a GPU wait
-        if cumulated.device.type == "cpu" and not cumulated[-1].isfinite():
+        total = cumulated[-1]
+        # Reading it would make a GPU wait.
+        if total.device.type == "cpu" and not total.isfinite():
             raise UserError(
                 "training has diverged: its errors are not finite; lower agent.learning_rate and "
                 "start again, or go on from an earlier checkpoint."
             )
-        options: Any = {"dtype": torch.float64, "device": self.device}
-        uniform = torch.rand(batch_size, generator=self._rng, **options)
-        # first the row in which the drawn mass lies, then the item within it
-        mass = _below(uniform * cumulated[-1], cumulated[-1])
+        uniform = torch.rand(
+            batch_size,
+            generator=self._rng,
+            dtype=torch.float64,
+            device=self.device,
+        )
+
+        # First the row in which the drawn mass lies.
+        mass = _below(uniform * total, total)
         row = torch.searchsorted(cumulated, mass, right=True)
-        rest = mass - (cumulated[row] - self.row_sums[row])
+
+        # Then the item within it, by the mass that is left after the rows before.
+        before = cumulated[row] - self.row_sums[row]
         within = self.priorities[row].double().cumsum(-1)
-        column = (within <= _below(rest, within[:, -1])[:, None]).sum(-1)
+        rest = _below(mass - before, within[:, -1])
+        column = (within <= rest[:, None]).sum(-1)
         index = row * ROW + column
-        # the item with the smallest priority has the largest weight, which becomes 1
+
+        # The item with the smallest priority has the largest weight, which becomes 1.
         chosen = self.priorities.view(-1)[index]
         weight = (chosen / chosen.amin()) ** -self._beta
         return index, {"priority_weight": weight}
 
     def state_dict(self) -> dict[str, Any]:
         """Priorities of the rows in use, the largest priority, and beta."""
-        # rows fill up from the first on
+        # Rows fill up from the first on.
         used = int((self.row_sums > 0).sum())
         return {
             "priorities": self.priorities[:used].clone(),
@@ -181,4 +224,5 @@ class RowSampler(PrioritizedSampler):
 
 def _below(value: Tensor, bound: Tensor) -> Tensor:
     """``value`` held strictly below ``bound``: rounding must not select past the last item."""
-    return torch.minimum(value, torch.nextafter(bound, torch.zeros_like(bound))).clamp_min(0.0)
+    largest = torch.nextafter(bound, torch.zeros_like(bound))
+    return torch.minimum(value, largest).clamp_min(0.0)

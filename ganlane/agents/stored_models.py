@@ -69,8 +69,9 @@ class Normaliser(Record):
 
     def normalize_obs(self, observation: Floats) -> Floats:
         """What a ``VecNormalize`` makes of observations [N, D]."""
+        mean = np.asarray(self.mean)
         deviation = np.sqrt(np.asarray(self.variance) + self.epsilon)
-        scaled = (observation - np.asarray(self.mean)) / deviation
+        scaled = (observation - mean) / deviation
         return np.clip(scaled, -self.clip_obs, self.clip_obs).astype(np.float32)
 
 
@@ -92,8 +93,11 @@ class Reading(Record):
     """What a model reads and commands, as the JSON beside its file says.
 
     Attributes:
+        observation: what it observes.
         mask: which actions it may choose; None: it is not told.
+        normaliser: of the observations; None: it reads them as they are.
         network: None: not one that can be rebuilt here.
+        actions: what its outputs stand for.
     """
 
     observation: ObservationConfig = field(default_factory=ObservationConfig)
@@ -119,10 +123,17 @@ class StoredModel(ObservationPolicy):
         self.normaliser = reading.normaliser
         self.is_masked = reading.mask is not None
         self.is_numbered = bool(reading.actions.names)
-        self.in_keys = [keys.OBSERVATION, *([keys.ACTION_MASK] if self.is_masked else [])]
+        self.in_keys = [keys.OBSERVATION]
+        if self.is_masked:
+            self.in_keys.append(keys.ACTION_MASK)
 
     def act(self, tensordict: TensorDictBase) -> Tensor:
-        """The largest output of every row, or the outputs."""
+        """The largest output of every row, or the outputs.
+
+        Raises:
+            UserError: the observation has another size than the network's input, or the model is
+                masked and the environment has no mask.
+        """
         observation = tensordict.get(keys.OBSERVATION)
         expected = self.layers[0].in_features
         if observation.shape[-1] != expected:
@@ -131,8 +142,10 @@ class StoredModel(ObservationPolicy):
                 f"{observation.shape[-1]}; use the observation, vehicles and lanes of its training."
             )
         if self.normaliser is not None:
+            # In NumPy, as VecNormalize does it.
             normalised = self.normaliser.normalize_obs(observation.cpu().numpy())
             observation = torch.from_numpy(normalised).to(observation.device)
+
         values = self.layers(observation)
         if not self.is_numbered:
             return values.clamp(-1.0, 1.0)
@@ -148,8 +161,12 @@ def description_of(file: Path) -> Path:
 
 def write_description(file: Path, reading: Reading) -> None:
     """The JSON file beside that of a model, whose checksum it holds."""
-    digest = hashlib.sha256(file.read_bytes()).hexdigest()
-    content = {"checksum": PLACE, "model_sha256": digest, "reads": plain(reading)}
+    content = {
+        # Of this JSON file; filled in as it is written.
+        "checksum": PLACE,
+        "model_sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+        "reads": plain(reading),
+    }
     write_json(description_of(file), content)
 
 
@@ -167,18 +184,26 @@ def save_network(path: str | Path, layers: nn.Sequential, reading: Reading | Non
         UserError: another kind of network.
     """
     file = Path(path)
-    linear, between = list(layers)[::2], list(layers)[1::2]
+    # Every other layer is linear, the first and the last one among them.
+    linear = list(layers)[::2]
+    between = list(layers)[1::2]
+    is_plain = len(linear) == len(between) + 1
+    is_plain = is_plain and all(type(layer) is nn.Linear for layer in linear)
+    # One kind of activation, of those that are known.
     kinds = {type(layer).__name__ for layer in between}
-    is_plain = len(linear) == len(between) + 1 and all(type(one) is nn.Linear for one in linear)
-    if file.suffix != ".zip" or not is_plain or len(kinds) != 1 or not kinds <= {*_ACTIVATIONS}:
+    is_plain = is_plain and len(kinds) == 1 and kinds <= {*_ACTIVATIONS}
+    if file.suffix != ".zip" or not is_plain:
         raise UserError(
             f"{path}: expected a file .zip, and Linear layers with one of "
             f"{', '.join(_ACTIVATIONS)} between them."
         )
+
+    # An archive as stable-baselines3 writes it, with the weights alone.
     weights = io.BytesIO()
     torch.save(layers.state_dict(), weights)
     with atomic_path(file) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("policy.pth", weights.getvalue())
+
     network = Network(_PLAIN, kinds.pop())
     write_description(file, replace(reading or Reading(), network=network))
 
@@ -215,6 +240,10 @@ def read_description(file: Path) -> Reading:
 def load_model(file: Path, device: str = "cpu") -> tuple[StoredModel, Reading]:
     """The policy of a stored model, and what it reads.
 
+    Args:
+        file: the archive; its description lies beside it.
+        device: of the policy.
+
     Raises:
         UserError: a missing or damaged file, or a network that is no plain MlpPolicy.
     """
@@ -232,37 +261,51 @@ def load_model(file: Path, device: str = "cpu") -> tuple[StoredModel, Reading]:
             f"{file}: no model of stable-baselines3 ({type(error).__name__}); give the file that "
             "ganlane.sb3.driver(model).save(path) wrote."
         ) from error
-    layers = _layers(state, network, len(reading.actions.names) or CONTROLS)
+
+    # An output for each action, or for each control where the actions are not numbered.
+    outputs = len(reading.actions.names) or CONTROLS
+    layers = _layers(state, network, outputs)
     if layers is None:
         raise _not_plain(file)
     return StoredModel(layers.to(device), reading), reading
 
 
-def _layers(state: Mapping[str, Any], network: Network, actions: int) -> nn.Sequential | None:
+def _layers(state: Mapping[str, Any], network: Network, outputs: int) -> nn.Sequential | None:
     """The network that acts, of a model's weights; None where they are of another form.
 
-    ``actions`` is the number of its outputs.
+    Args:
+        state: the weights by name, of all that the model has.
+        network: its form.
+        outputs: how many it has to have.
     """
+    # Hidden layers are numbered, with gaps for the activations between them.
     hidden, last = NETWORKS[network.algorithm]
-    numbers = sorted(
-        int(match[1])
-        for name in state
-        if (match := re.fullmatch(rf"{re.escape(hidden)}(\d+)\.weight", name))
-    )
-    places = [f"{hidden}{number}." for number in numbers] + ([last] if last else [])
+    numbers = []
+    for name in state:
+        match = re.fullmatch(rf"{re.escape(hidden)}(\d+)\.weight", name)
+        if match:
+            numbers.append(int(match[1]))
+    places = [f"{hidden}{number}." for number in sorted(numbers)]
+    if last:
+        places.append(last)
+
+    # Weights that are neither expected nor known not to act are of another form.
     expected = {f"{place}{part}" for place in places for part in ("weight", "bias")}
     others = {name for name in state if name.startswith(_OTHERS)}
     if not places or expected | others != set(state):
         return None
+
     modules: list[nn.Module] = []
     for place in places:
-        weight, bias = state[f"{place}weight"], state[f"{place}bias"]
+        weight = state[f"{place}weight"]
+        bias = state[f"{place}bias"]
         linear = nn.Linear(weight.shape[1], weight.shape[0])
         linear.load_state_dict({"weight": weight, "bias": bias})
         modules += [linear, getattr(nn, network.activation)()]
+    if linear.out_features != outputs:
+        return None
     # Nothing comes after the last layer.
-    layers = nn.Sequential(*modules[:-1])
-    return layers if modules[-2].out_features == actions else None
+    return nn.Sequential(*modules[:-1])
 
 
 def _not_plain(file: Path) -> UserError:

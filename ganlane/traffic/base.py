@@ -56,7 +56,9 @@ def zero_memory(fields: MemoryFields, x: Tensor) -> dict[str, Any]:
 def memory_of(tensordict: TensorDictBase, key: str = keys.TRAFFIC) -> TensorDictBase:
     """The memory under ``key``; empty if it is missing, since TorchRL drops empty TensorDicts."""
     memory = tensordict.get(key, None)
-    return TensorDict({}, batch_size=tensordict.batch_size) if memory is None else memory
+    if memory is None:
+        return TensorDict({}, batch_size=tensordict.batch_size)
+    return memory
 
 
 def with_rows(whole: TensorDictBase, rows: Tensor, part: Mapping[str, Any]) -> TensorDict:
@@ -77,7 +79,9 @@ def with_rows(whole: TensorDictBase, rows: Tensor, part: Mapping[str, Any]) -> T
 
 def where_rows(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
     """``new`` where ``rows`` [N] is true, ``old`` elsewhere; both [N, ...]."""
-    return torch.where(rows.view(-1, *[1] * (new.ndim - 1)), new, old)
+    # [N, 1, ...], with as many dimensions as the tensors.
+    ones = [1] * (new.ndim - 1)
+    return torch.where(rows.view(-1, *ones), new, old)
 
 
 def key_of(tensordict: TensorDictBase, stream: int) -> Tensor:
@@ -91,7 +95,14 @@ def key_of(tensordict: TensorDictBase, stream: int) -> Tensor:
 def uniforms(
     vehicles: Vehicles, key: Tensor, step: Tensor | int, *purposes: int
 ) -> tuple[Tensor, ...]:
-    """A uniform number in [0, 1) for every vehicle, [N, M], of each of the ``purposes``."""
+    """A uniform number in [0, 1) for every vehicle, [N, M], of each of the ``purposes``.
+
+    Args:
+        vehicles: whose number M and float type count.
+        key: of the episodes, [N].
+        step: physics steps since their start, [N]; -1 before the first one.
+        purposes: one for each use, so that they are independent of each other.
+    """
     # All purposes in one call, which shares the hashing of episode and step.
     x = vehicles.x
     return uniform(key, step, x.shape[1], list(purposes), x.dtype).unbind(-1)
@@ -201,14 +212,17 @@ class TrafficModule(TensorDictModuleBase):
         """Write ``moved`` and ``traffic``."""
         # Plain fields from here on, so that a model needs to know nothing of TensorDicts.
         memory = dict(memory_of(tensordict).items())
-        counters = (key_of(tensordict, self.stream), tensordict.get(keys.STEP))
-        moved, memory = self._call(tensordict, memory, *counters)
+        key = key_of(tensordict, self.stream)
+        step = tensordict.get(keys.STEP)
+        moved, memory = self._call(tensordict, memory, key, step)
+
         n = tensordict.batch_size[0]
         tensordict.set(keys.MOVED, new_tensordict(moved.as_dict(), n))
         return tensordict.set(keys.TRAFFIC, new_tensordict(memory, n))
 
     def _call(self, state: TensorDictBase, memory: Memory, key: Tensor, step: Tensor) -> Moved:
-        return self.move(Vehicles.of(state.get(keys.VEHICLES)), memory, key, step)
+        vehicles = Vehicles.of(state.get(keys.VEHICLES))
+        return self.move(vehicles, memory, key, step)
 
     @outside_autocast
     def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
@@ -221,7 +235,8 @@ class TrafficModule(TensorDictModuleBase):
             key, episode: the episodes' keys and numbers, [N] int64.
         """
         # What is drawn at the start has a key of its own, apart from the draws of the steps.
-        return vehicles, new_tensordict(self.fresh_memory(vehicles, absorb(key, 0)), len(key))
+        memory = self.fresh_memory(vehicles, absorb(key, 0))
+        return vehicles, new_tensordict(memory, len(key))
 
 
 class Overlay(TrafficModule):
@@ -233,7 +248,12 @@ class Overlay(TrafficModule):
     heeds_lane_ends = True  # as far as the model below does
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """The new ``moved``, and the memory to keep; arguments as in :meth:`TrafficModule.move`."""
         raise NotImplementedError

@@ -52,16 +52,20 @@ def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: flo
     distance driven.
     """
     speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
-    # Trapezoids, as in dynamics.advance: the distance that the model drives, then this one.
+    # Trapezoids, as in dynamics.advance: the distance that the model drives, then this one, m.
     usual = 0.5 * (vehicles.speed + moved.speed) * dt
     distance = 0.5 * (vehicles.speed + speed) * dt
     # How much of the usual step is driven.
     share = distance / usual.clamp_min(_SHORTEST_M)
-    # A standing vehicle that moves off has no path to follow yet, and its share means nothing.
-    path = usual > _SHORTEST_M
-    dx = torch.where(path, share * (moved.x - vehicles.x), distance * torch.cos(vehicles.heading))
-    dy = torch.where(path, share * (moved.y - vehicles.y), distance * torch.sin(vehicles.heading))
-    turn = torch.where(path, share * (moved.heading - vehicles.heading), 0.0)
+
+    # A standing vehicle that moves off has no path to follow yet, and its share means nothing: it
+    # goes straight on.
+    has_path = usual > _SHORTEST_M
+    straight_x = distance * torch.cos(vehicles.heading)
+    straight_y = distance * torch.sin(vehicles.heading)
+    dx = torch.where(has_path, share * (moved.x - vehicles.x), straight_x)
+    dy = torch.where(has_path, share * (moved.y - vehicles.y), straight_y)
+    turn = torch.where(has_path, share * (moved.heading - vehicles.heading), 0.0)
     return moved.with_(
         x=vehicles.x + dx,
         y=vehicles.y + dy,
@@ -74,7 +78,13 @@ def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: flo
 class Fault(Overlay, Generic[Faults]):
     """A fault that comes at random, as often as its ``faults`` say.
 
-    ``kind`` is the record of ``faults``, ``purpose`` that of its random numbers.
+    Args:
+        road, stream: as for every traffic module.
+        faults: how often, and how bad; None: those of :attr:`kind`'s defaults.
+
+    Attributes:
+        kind: the record of ``faults``.
+        purpose: that of its random numbers.
     """
 
     kind: type[Faults]
@@ -99,7 +109,8 @@ class TimedFault(Fault[Timed]):
         comes = u < chance_in_step(self.faults.per_hour)
         # A fault that lasts is not prolonged by a second one.
         begins = (left == 0) & other_drivers(vehicles) & comes
-        return torch.where(begins, round(self.faults.lasts_s / self.dt), left)
+        all_steps = round(self.faults.lasts_s / self.dt)
+        return torch.where(begins, all_steps, left)
 
 
 class PhantomBraking(TimedFault[BrakingFaults]):
@@ -110,7 +121,12 @@ class PhantomBraking(TimedFault[BrakingFaults]):
     purpose = Purpose.FAULT
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """Brake during a fault."""
         left = self.steps_left(memory["left"], vehicles, key, step)
@@ -118,7 +134,8 @@ class PhantomBraking(TimedFault[BrakingFaults]):
         # A driver who brakes harder anyway goes on doing so.
         brakes = (left > 0) & (moved.acceleration > wanted)
         braking = driven_at(vehicles, moved, wanted, self.dt)
-        return braking.where(brakes, moved), {"left": (left - 1).clamp_min(0)}
+        moved = braking.where(brakes, moved)
+        return moved, {"left": (left - 1).clamp_min(0)}
 
 
 class LateReaction(TimedFault[ReactionFaults]):
@@ -131,6 +148,9 @@ class LateReaction(TimedFault[ReactionFaults]):
 
     Memory: ``past`` [N, M, D], the accelerations decided in the last ``delay_s``, m/s2, oldest
     first (at the start the present one), and ``left``, the remaining steps of the lapse.
+
+    Attributes:
+        delay_steps: D, the physics steps of ``delay_s``.
     """
 
     kind = ReactionFaults
@@ -145,7 +165,10 @@ class LateReaction(TimedFault[ReactionFaults]):
         super().__init__(road, stream, faults)
         # At least 1, since delay_s is a physics step or longer.
         self.delay_steps = round(self.faults.delay_s / self.dt)
-        self.memory_fields = {"past": ((self.delay_steps,), None), "left": ((), torch.int64)}
+        self.memory_fields = {
+            "past": ((self.delay_steps,), None),
+            "left": ((), torch.int64),
+        }
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """No lapse, a constant past acceleration."""
@@ -154,15 +177,25 @@ class LateReaction(TimedFault[ReactionFaults]):
         return {"past": past, "left": torch.zeros_like(vehicles.target_lane)}
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """Drive at the acceleration of ``delay_s`` ago during a lapse."""
         left = self.steps_left(memory["left"], vehicles, key, step)
+        past = memory["past"]
         # Entry 0 is the oldest: decided delay_s ago.
-        late = driven_at(vehicles, moved, memory["past"][..., 0], self.dt)
-        # The model's decision is stored during a lapse, too, so the queue never has a hole.
-        past = torch.cat((memory["past"][..., 1:], moved.acceleration[..., None]), dim=-1)
-        return late.where(left > 0, moved), {"past": past, "left": (left - 1).clamp_min(0)}
+        late = driven_at(vehicles, moved, past[..., 0], self.dt)
+
+        new_memory = {
+            # The model's decision is stored during a lapse, too, so the queue never has a hole.
+            "past": torch.cat((past[..., 1:], moved.acceleration[..., None]), dim=-1),
+            "left": (left - 1).clamp_min(0),
+        }
+        return late.where(left > 0, moved), new_memory
 
 
 class HesitantLaneChange(Fault[HesitationFaults]):
@@ -177,25 +210,35 @@ class HesitantLaneChange(Fault[HesitationFaults]):
     purpose = Purpose.HESITANT_CHANGE
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """Reduce the lateral motion of hesitant changes."""
         begins = starting(vehicles, moved)
         (u,) = uniforms(vehicles, key, step, self.purpose)
         # Decided once, when the change begins.
         hesitant = torch.where(begins, u < self.faults.share, memory["hesitant"])
+
         # From the position at t: only the step's lateral part shrinks.
         slowed = vehicles.y + self.faults.pace * (moved.y - vehicles.y)
         moved = moved.with_(y=torch.where(hesitant, slowed, moved.y))
+
         # The flag ends with the change; the next change draws anew.
-        return moved, {"hesitant": hesitant & ~lane_change_done(moved, self.road)}
+        done = lane_change_done(moved, self.road)
+        return moved, {"hesitant": hesitant & ~done}
 
 
 class AbortedLaneChange(Fault[AbortFaults]):
     """Some changes are aborted: the driver turns back to its old lane.
 
     At the default of half way the body is still in the old lane, where the others have seen it all
-    the time, so its place there is free. Memory: the lane to turn back to (-1: none).
+    the time, so its place there is free.
+
+    Memory: ``origin``, the lane to turn back to (-1: none).
     """
 
     memory_fields = {"origin": ((), torch.int64)}  # noqa: RUF012
@@ -207,28 +250,44 @@ class AbortedLaneChange(Fault[AbortFaults]):
         return {"origin": torch.full_like(vehicles.target_lane, _NO_LANE)}
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """Set the old lane as the target where the change has come far enough."""
         begins = starting(vehicles, moved)
         (u,) = uniforms(vehicles, key, step, self.purpose)
         # Where a change will be aborted, the lane to return to.
-        chosen = torch.where(u < self.faults.share, vehicles.target_lane, _NO_LANE)
+        aborts = u < self.faults.share
+        chosen = torch.where(aborts, vehicles.target_lane, _NO_LANE)
         origin = torch.where(begins, chosen, memory["origin"])
+
         # Where nothing will be aborted, origin is -1 and start is not used.
         start = self.road.centre_of(origin, moved.y.dtype)
         end = self.road.centre_of(moved.target_lane, moved.y.dtype)
         # The share ``at`` of the way between the two centres is done.
-        far_enough = (moved.y - start).abs() >= self.faults.at * (end - start).abs()
+        way_done = (moved.y - start).abs()
+        far_enough = way_done >= self.faults.at * (end - start).abs()
+
         turns = (origin != _NO_LANE) & far_enough
         moved = moved.with_(target_lane=torch.where(turns, origin, moved.target_lane))
         return moved, {"origin": torch.where(turns, _NO_LANE, origin)}
 
 
 def with_faults(base: TrafficModule, faults: DriverFaults | None = None) -> TrafficSequential:
-    """``base`` (any traffic model or chain) with all four faults laid over it.
+    """``base`` with all four faults laid over it.
 
     Phantom braking comes after the late reactions, since it is no reaction and must not be delayed.
+
+    Args:
+        base: any traffic model or chain.
+        faults: how often, and how bad; None: the defaults.
+
+    Raises:
+        UserError: ``base`` plays recordings.
     """
     faults = faults or DriverFaults()
     road = (base.road, base.stream)
@@ -240,5 +299,8 @@ def with_faults(base: TrafficModule, faults: DriverFaults | None = None) -> Traf
         "hesitant_change": HesitantLaneChange(*road, faults.hesitant_change),
         "aborted_change": AbortedLaneChange(*road, faults.aborted_change),
     }
+    # The kernel knows faults of IDM and MOBIL's drivers only; other traffic runs in tensor code.
     drivers = base.native_drivers() if type(base) is IdmMobilTraffic else None
-    return TrafficSequential(parts, None if drivers is None else faulty_drivers(drivers, faults))
+    if drivers is None:
+        return TrafficSequential(parts)
+    return TrafficSequential(parts, faulty_drivers(drivers, faults))

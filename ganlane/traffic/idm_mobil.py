@@ -36,7 +36,12 @@ _PARAMETERS = "traits"
 class IdmTraffic(TrafficModule):
     """``traffic=idm``: all keep their lanes (the paper's Traffic_IDM, 'without complex decisions').
 
-    Memory: the steering angle of each vehicle, rad.
+    Memory: ``steering``, the steering angle of each vehicle, rad.
+
+    Args:
+        road, stream: as for every traffic module.
+        idm: of all drivers.
+        steering: the controller that keeps them in their lanes.
     """
 
     heeds_lane_ends = True
@@ -62,7 +67,11 @@ class IdmTraffic(TrafficModule):
         if type(self) not in (IdmTraffic, IdmMobilTraffic, IdmRandomTraffic):
             return None
         return RuleDrivers(
-            self.idm, self.steering, self.mobil, random=self.drivers, stream=self.stream
+            self.idm,
+            self.steering,
+            self.mobil,
+            random=self.drivers,
+            stream=self.stream,
         )
 
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
@@ -86,23 +95,40 @@ class IdmTraffic(TrafficModule):
         return following_acceleration(scene, idm)
 
     def advanced(
-        self, scene: Scene, acceleration: Tensor, target: Tensor, line: Tensor, memory: Memory
+        self,
+        scene: Scene,
+        acceleration: Tensor,
+        target: Tensor,
+        line: Tensor,
+        memory: Memory,
     ) -> Moved:
         """The vehicles at t + 0.1 s.
 
         Args:
+            scene: at t.
             acceleration: that is driven, m/s2, [N, M].
             target: lanes that others may see the change to, [N, M] int64.
             line: lateral positions that the drivers steer to, m, [N, M].
+            memory: with the steering angles at t.
         """
         moved, steering = drive(
-            scene.vehicles, acceleration, memory["steering"], line, self.dt, self.steering
+            scene.vehicles,
+            acceleration,
+            memory["steering"],
+            line,
+            self.dt,
+            self.steering,
         )
         return moved.with_(target_lane=target), {"steering": steering}
 
 
 class IdmMobilTraffic(IdmTraffic):
-    """``traffic=idm_mobil``: IDM with MOBIL's lane changes once a second (Tables IV and V)."""
+    """``traffic=idm_mobil``: IDM with MOBIL's lane changes once a second (Tables IV and V).
+
+    Args:
+        road, stream, idm, steering: as of the base.
+        mobil: of all drivers; also how they leave a lane that ends, and make room.
+    """
 
     mobil: MobilParameters
 
@@ -134,7 +160,8 @@ class IdmMobilTraffic(IdmTraffic):
         acceleration = super().following(scene, idm)
         if not self.road.stretches:
             return acceleration
-        return torch.minimum(acceleration, yielding(scene, idm, self.mobil))
+        makes_room = yielding(scene, idm, self.mobil)
+        return torch.minimum(acceleration, makes_room)
 
     def changes(self, scene: Scene, memory: Memory) -> Tensor:
         """The side that each driver changes to, -1, 0 or 1, [N, M]."""
@@ -144,8 +171,15 @@ class IdmMobilTraffic(IdmTraffic):
 class DriverParams(NamedTuple):
     """Per-driver parameters, tensors [N, M]; names and units as in :class:`RandomDrivers`.
 
-    ``delay`` is the reaction time in physics steps; the last four are angular frequencies (rad/s)
-    and phases (rad) of the two waves that make up a driver's sway.
+    Attributes:
+        headway: s.
+        max_acceleration, comfortable_deceleration, strongest_braking: m/s2, all above 0.
+        politeness: factor on MOBIL's weights of the followers.
+        delay: reaction time in physics steps, a whole number.
+        sway: largest distance from the centre of the lane that a driver aims at, m.
+        frequency_one, frequency_two: angular frequencies of the two waves that make up a driver's
+            sway, rad/s.
+        phase_one, phase_two: of these waves, rad.
     """
 
     headway: Tensor
@@ -181,10 +215,10 @@ class DriverParams(NamedTuple):
 
     def sway_m(self, time_s: Tensor) -> Tensor:
         """How far each driver aims to the left of its lane's centre at ``time_s`` [N, 1], m."""
-        one = torch.sin(self.frequency_one * time_s + self.phase_one)
-        two = torch.sin(self.frequency_two * time_s + self.phase_two)
+        wave_one = torch.sin(self.frequency_one * time_s + self.phase_one)
+        wave_two = torch.sin(self.frequency_two * time_s + self.phase_two)
         # Two sines add up to at most 2, so the sway stays within its bound.
-        return 0.5 * self.sway * (one + two)
+        return 0.5 * self.sway * (wave_one + wave_two)
 
 
 def start_braking(
@@ -193,7 +227,12 @@ def start_braking(
     """Deceleration (m/s2, [N, M]) with which each driver stays behind all ahead in its lane.
 
     These keep their speeds; each vehicle in between takes the longest length and ``min_gap_m``.
-    Braking begins after ``reaction_s`` [N, M].
+
+    Args:
+        vehicles: the initial scene, [N, M].
+        road: under it.
+        reaction_s: after which braking begins, [N, M].
+        min_gap_m: between two standing vehicles.
     """
     scene = perceive(vehicles, road)
     pairs = scene.pairs
@@ -207,9 +246,10 @@ def start_braking(
     # between.
     distance = torch.where(ahead, pairs.distance, torch.inf)
     between = distance.argsort(-1).argsort(-1).to(vehicles.x.dtype)
-    space = vehicles.length.amax(-1)[:, None, None] + min_gap_m
+    longest = vehicles.length.amax(-1)[:, None, None]
+    space = longest + min_gap_m
 
-    # What is left of the gap once the driver reacts.
+    # What is left of the gap, m, once the driver reacts.
     speed = vehicles.speed[:, :, None]
     leader_speed = vehicles.speed[:, None, :]
     closing = (speed - leader_speed).clamp_min(0.0)
@@ -225,9 +265,10 @@ class IdmRandomTraffic(IdmMobilTraffic):
     episode.
 
     In MOBIL a driver predicts the others with its own parameters, since it does not know theirs,
-    and without a limit of braking. Memory: the steering angle, ``traits`` [N, M, 11]
-    (:class:`DriverParams`) and, with reaction times, ``past`` [N, M, D], the accelerations decided
-    in the last D steps, m/s2, oldest first.
+    and without a limit of braking.
+
+    Memory: ``steering``, ``traits`` [N, M, 11] (:class:`DriverParams`) and, with reaction times,
+    ``past`` [N, M, D], the accelerations decided in the last D steps, m/s2, oldest first.
 
     Args:
         road, stream, steering: as for every rule-driven traffic.
@@ -250,8 +291,12 @@ class IdmRandomTraffic(IdmMobilTraffic):
         super().__init__(road, stream, idm, steering, mobil)
         self.drivers = drivers or RandomDrivers()
         # The queue is as long as the slowest driver's reaction.
-        self.delay_steps = round(self.drivers.reaction_s[1] / self.dt)
-        fields = {"steering": ((), None), _PARAMETERS: ((len(DriverParams._fields),), None)}
+        slowest_s = self.drivers.reaction_s[1]
+        self.delay_steps = round(slowest_s / self.dt)
+        fields = {
+            "steering": ((), None),
+            _PARAMETERS: ((len(DriverParams._fields),), None),
+        }
         if self.delay_steps:
             fields["past"] = ((self.delay_steps,), None)
         self.memory_fields = fields
@@ -302,16 +347,18 @@ class IdmRandomTraffic(IdmMobilTraffic):
         """Gives every driver but the ego its own desired speed."""
         (u,) = uniforms(vehicles, absorb(key, 0), -1, _DESIRED_SPEED)
         factor = in_range(u, self.drivers.desired_speed)
-        desired = factor * vehicles.desired_speed
+        desired_speed = factor * vehicles.desired_speed
         # The ego's is the environment's.
-        desired[:, EGO_INDEX] = vehicles.desired_speed[:, EGO_INDEX]
-        return super().enter(vehicles.with_(desired_speed=desired), key, episode)
+        desired_speed[:, EGO_INDEX] = vehicles.desired_speed[:, EGO_INDEX]
+        vehicles = vehicles.with_(desired_speed=desired_speed)
+        return super().enter(vehicles, key, episode)
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """Steering angle 0, a constant past acceleration, and the drivers' parameters."""
         memory = super().fresh_memory(vehicles, key)
         memory[_PARAMETERS] = torch.stack(self.driver_params(vehicles, key), dim=-1)
         if self.delay_steps:
+            # As if the driver had always accelerated as it does now.
             memory["past"] = vehicles.acceleration[..., None].repeat(1, 1, self.delay_steps)
         return memory
 
@@ -341,9 +388,9 @@ class IdmRandomTraffic(IdmMobilTraffic):
             new_memory["past"] = recent[..., 1:].contiguous()
 
         # Drivers aim beside the centres of their lanes, m.
-        time_s = (step.to(drivers.sway.dtype) * self.dt)[:, None]
+        time_s = step.to(drivers.sway.dtype) * self.dt
         centre = self.road.centre_of(target, scene.vehicles.y.dtype)
-        line = centre + drivers.sway_m(time_s)
+        line = centre + drivers.sway_m(time_s[:, None])
 
         moved, steering = self.advanced(scene, acceleration, target, line, memory)
         return moved, {**steering, **new_memory}

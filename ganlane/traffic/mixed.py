@@ -6,7 +6,6 @@ Which one an episode gets follows from its number or key, so it is the same in e
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -51,8 +50,12 @@ class MixedTraffic(TrafficParts):
         UserError: no parts, shares of other names, or a part that plays recordings.
     """
 
+    # [sum of the shares]: the index of the part whose turn it is.
+    turns: Tensor
+
     def __init__(self, parts: Mapping[str, TrafficModule], shares: Mapping[str, int]) -> None:
-        if not parts or set(parts) != set(shares) or min(shares.values()) < 1:
+        same_names = set(parts) == set(shares)
+        if not parts or not same_names or min(shares.values()) < 1:
             raise UserError(
                 f"traffic.shares={dict(shares)}: expected a whole number of at least 1 for each of "
                 f"the parts ({', '.join(parts) or 'none'}); give for instance "
@@ -71,11 +74,15 @@ class MixedTraffic(TrafficParts):
                     "traffic.shares: the parts have different roads or streams; build all with the "
                     "same."
                 )
+
         # One visibility for all, or each episode has that of its part (:meth:`enter`).
         visibilities = {int(part.visibility) for part in parts.values()}
-        self.visibility = visibilities.pop() if len(visibilities) == 1 else VISIBILITY_OF_EPISODE
-        names = list(parts)
+        self.visibility = VISIBILITY_OF_EPISODE
+        if len(visibilities) == 1:
+            self.visibility = visibilities.pop()
+
         # Not saved: it follows from the shares.
+        names = list(parts)
         turns = torch.tensor([names.index(name) for name in interleaved(shares)])
         self.register_buffer("turns", turns, persistent=False)
         self._shares = {name.replace(".", "_"): share for name, share in shares.items()}
@@ -83,46 +90,63 @@ class MixedTraffic(TrafficParts):
         self._rows: tuple[Tensor, list[RowsOfPart]] | None = None
 
     def native_drivers(self) -> Drivers | None:
-        """Those of the parts, in turns."""
+        """Those of the parts, in turns; None where the kernel cannot drive one of them."""
         parts = {name: part.native_drivers() for name, part in self.named_parts()}
         return mixed_drivers(parts, self._shares)
 
     def part_of(self, episode: Tensor) -> Tensor:
-        """Index of the part that each ``episode`` [N] belongs to."""
-        turns = cast(Tensor, self.turns)
-        return turns[episode % len(turns)]
+        """Index of the part that each ``episode`` [N] belongs to, [N] int64."""
+        return self.turns[episode % len(self.turns)]
 
     def rows_of_parts(self, episode: Tensor) -> list[RowsOfPart]:
-        """The parts that have rows in the batch of ``episode`` [N].
+        """The parts that have rows in the batch, and their rows.
 
         On a GPU this waits for the queue once.
+
+        Args:
+            episode: number of the episode of every row, [N] int64.
         """
         part_of_row = self.part_of(episode)
         numbers = torch.arange(len(self.parts), device=episode.device)
+        # How many rows each part has.
         sizes = (part_of_row[:, None] == numbers).sum(0).tolist()
+        # Sorted by part: the rows of the first one, then those of the second, and so on.
         rows_of_part = part_of_row.argsort(stable=True).split(sizes)
-        parts = zip(self.named_parts(), rows_of_part)
-        return [(name, part, rows) for (name, part), rows in parts if len(rows)]
+
+        parts = []
+        for (name, part), rows in zip(self.named_parts(), rows_of_part):
+            if len(rows):
+                parts.append((name, part, rows))
+        return parts
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic``, each part its rows."""
         vehicles = tensordict.get(keys.VEHICLES)
+        episode = tensordict.get(keys.EPISODE)
+        # The steps of a decision share the tensor of the keys, which is made anew for the next.
+        key = key_of(tensordict, self.stream)
+        if self._rows is None or self._rows[0] is not key:
+            self._rows = key, self.rows_of_parts(episode)
+
+        inputs = {
+            keys.SEED: tensordict.get(keys.SEED),
+            keys.EPISODE: episode,
+            keys.STEP: tensordict.get(keys.STEP),
+            keys.EPISODE_KEY: key,
+            keys.VEHICLES: vehicles,
+        }
         memories = memory_of(tensordict)
         moved = vehicles
         new_memories = dict(memories.items())
-        inputs = {name: tensordict.get(name) for name in (keys.SEED, keys.EPISODE, keys.STEP)}
-        # The steps of a decision share the tensor of the keys, which is made anew for the next.
-        key = key_of(tensordict, self.stream)
-        inputs |= {keys.EPISODE_KEY: key, keys.VEHICLES: vehicles}
-        if self._rows is None or self._rows[0] is not key:
-            self._rows = key, self.rows_of_parts(inputs[keys.EPISODE])
         for name, part, rows in self._rows[1]:
             memory = memory_of(memories, name)
-            taken = new_tensordict({**inputs, keys.TRAFFIC: memory}, len(key))[rows]
+            of_all = new_tensordict({**inputs, keys.TRAFFIC: memory}, len(key))
+            taken = of_all[rows]
             before = taken.get(keys.VEHICLES)
             output = part(taken)
-            # Vehicles are compared by name, since other parts have written into the others' rows.
-            # `is`, not ==: a field that was only passed on needs no write.
+
+            # Field by field, what the part has changed. `is`, not ==: a field that was only passed
+            # on needs no write.
             changed = {
                 field: value
                 for field, value in output.get(keys.MOVED).items()
@@ -130,6 +154,7 @@ class MixedTraffic(TrafficParts):
             }
             moved = with_rows(moved, rows, changed)
             new_memories[name] = with_rows(memory, rows, memory_of(output))
+
         tensordict.set(keys.MOVED, moved)
         return tensordict.set(keys.TRAFFIC, new_tensordict(new_memories, len(key)))
 
@@ -138,17 +163,20 @@ class MixedTraffic(TrafficParts):
         n = len(key)
         together = new_tensordict(vehicles.as_dict(), n)
         memories = new_tensordict(zero_memory(self.memory_fields, vehicles.x), n)
+
         for name, part, rows in self.rows_of_parts(episode):
             # A traffic sees only its own rows of the scene.
             scene = vehicles.part(rows)
+
             # Here the part is known, so the placeholder becomes its visibility.
             of_episode = scene.visibility == VISIBILITY_OF_EPISODE
             visibility = torch.where(of_episode, int(part.visibility), scene.visibility)
-            entered, memory = part.enter(
-                scene.with_(visibility=visibility), key[rows], episode[rows]
-            )
+            scene = scene.with_(visibility=visibility)
+
+            entered, memory = part.enter(scene, key[rows], episode[rows])
             together = with_rows(together, rows, entered.as_dict())
             memories.set(name, with_rows(memories.get(name), rows, memory))
+
         return Vehicles.of(together), memories
 
 
@@ -176,6 +204,7 @@ class BlindTraffic(TrafficModule):
         super().__init__(model.road, model.stream)
         self.model = model
         self.blind_share = blind_share
+        # For the rest it is as the model.
         self.visibility = model.visibility
         self.rows_must_stay = model.rows_must_stay
         self.heeds_lane_ends = model.heeds_lane_ends
@@ -190,19 +219,32 @@ class BlindTraffic(TrafficModule):
         """Write ``moved`` and ``traffic`` of the model, which does not see hidden egos."""
         vehicles = tensordict.get(keys.VEHICLES)
         unseen = self.unseen(Vehicles.of(vehicles), key_of(tensordict, self.stream))
+
         # The copies are shallow: the state at t is not written to.
-        seen = vehicles.copy().set("valid", vehicles.get("valid") & ~unseen)
-        inputs = self.model(tensordict.copy().set(keys.VEHICLES, seen))
+        seen = vehicles.copy()
+        seen.set("valid", vehicles.get("valid") & ~unseen)
+        inputs = tensordict.copy()
+        inputs.set(keys.VEHICLES, seen)
+        output = self.model(inputs)
+
         # What becomes of a hidden ego here does not matter: the environment overwrites it.
-        tensordict.set(keys.MOVED, inputs.get(keys.MOVED))
-        return tensordict.set(keys.TRAFFIC, inputs.get(keys.TRAFFIC))
+        tensordict.set(keys.MOVED, output.get(keys.MOVED))
+        return tensordict.set(keys.TRAFFIC, output.get(keys.TRAFFIC))
 
     def unseen(self, vehicles: Vehicles, key: Tensor) -> Tensor:
-        """The egos of blind episodes, bool [N, M]; ``key`` [N] of the episodes."""
+        """The egos of blind episodes, bool [N, M].
+
+        Args:
+            vehicles: at any step, [N, M].
+            key: of the episodes, [N] int64.
+        """
         # Drawn before the first step, by a key of its own. In float64, so that the same episodes
         # are blind in runs of either float type.
-        u = uniform(absorb(key, 0), -1, 1, [Purpose.BLIND_EPISODE], torch.float64)[..., 0]
-        return (u < self.blind_share) & vehicles.is_ego()
+        entering = absorb(key, 0)
+        # [N, 1]: one number for each episode.
+        u = uniform(entering, -1, 1, [Purpose.BLIND_EPISODE], torch.float64)[..., 0]
+        is_blind = u < self.blind_share
+        return is_blind & vehicles.is_ego()
 
     def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """As the model."""

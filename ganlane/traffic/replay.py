@@ -3,6 +3,8 @@
 All samples are in one table. A sample is one vehicle in one frame; the samples of a track follow
 each other, 0.1 s apart, so ``k`` steps after sample ``s`` the vehicle is at sample ``s + k``, as
 long as its track lasts.
+
+Shapes: R samples, S scenes, and K starts of episodes with up to P vehicles each.
 """
 
 from __future__ import annotations
@@ -55,7 +57,7 @@ LEAST_DESIRED_SPEED_MPS = 10.0
 def _with_tracks(frame: pl.DataFrame, lane_widths: dict[str, float]) -> pl.DataFrame:
     """The samples with their ``index`` and their track's ``first`` and ``last`` one.
 
-    ``fastest`` is its highest speed. A missing frame ends a track.
+    ``fastest`` is its highest speed, m/s. A missing frame ends a track.
     """
     tracks = tracks_of_frame(frame, lane_widths)
     return frame.with_columns(
@@ -67,24 +69,30 @@ def _with_tracks(frame: pl.DataFrame, lane_widths: dict[str, float]) -> pl.DataF
 
 def _motion(samples: pl.DataFrame) -> Tensor:
     """The float fields of every sample, [R, 8] float64, ordered as ``VEHICLE_FLOATS``."""
-    column = {name: samples[name].to_numpy() for name in samples.columns if name != "scene"}
-    x, y, speed, index = (column[name] for name in ("x", "y", "speed", "index"))
-    # Positions in the table, clipped to the vehicle's own track.
-    early = np.maximum(index - _HALF_WINDOW, column["first"])
-    late = np.minimum(index + _HALF_WINDOW, column["last"])
+    x = samples["x"].to_numpy()
+    y = samples["y"].to_numpy()
+    speed = samples["speed"].to_numpy()
+    index = samples["index"].to_numpy()
+
+    # The window, as positions in the table, clipped to the vehicle's own track.
+    early = np.maximum(index - _HALF_WINDOW, samples["first"].to_numpy())
+    late = np.minimum(index + _HALF_WINDOW, samples["last"].to_numpy())
+    # It is shorter at a track's ends, and a single sample has none.
+    window_s = np.maximum((late - early) * FRAME_S, FRAME_S)
+    along_m = np.maximum(x[late] - x[early], _LEAST_PATH_M)
+
     fields = {
         "x": x,
         "y": y,
-        "heading": np.arctan((y[late] - y[early]) / np.maximum(x[late] - x[early], _LEAST_PATH_M)),
+        "heading": np.arctan((y[late] - y[early]) / along_m),
         "speed": speed,
-        # The window is shorter at a track's ends, and a single sample has none.
-        "acceleration": (speed[late] - speed[early])
-        / np.maximum((late - early) * FRAME_S, FRAME_S),
-        "length": column["length"],
-        "width": column["width"],
-        "desired_speed": np.maximum(column["fastest"], LEAST_DESIRED_SPEED_MPS),
+        "acceleration": (speed[late] - speed[early]) / window_s,
+        "length": samples["length"].to_numpy(),
+        "width": samples["width"].to_numpy(),
+        "desired_speed": np.maximum(samples["fastest"].to_numpy(), LEAST_DESIRED_SPEED_MPS),
     }
-    return torch.from_numpy(np.stack([fields[name] for name in VEHICLE_FLOATS], axis=1))
+    columns = [fields[name] for name in VEHICLE_FLOATS]
+    return torch.from_numpy(np.stack(columns, axis=1))
 
 
 def _starts(samples: pl.DataFrame, least: int) -> tuple[pl.DataFrame, Tensor]:
@@ -93,6 +101,10 @@ def _starts(samples: pl.DataFrame, least: int) -> tuple[pl.DataFrame, Tensor]:
     The ego replaces the vehicle nearest the middle of those that are recorded ``least`` frames on.
     The middle is the median position along the road of all that are recorded in the frame.
 
+    Args:
+        samples: of :func:`_with_tracks`.
+        least: frames that the replaced vehicle has to be recorded after the start.
+
     Returns:
         ``scene`` and ``steps`` (frames to the end of the scene) of the K starts, and the samples
         [K, P] in their first frame: the vehicle that the ego replaces, then the others, nearest
@@ -100,35 +112,47 @@ def _starts(samples: pl.DataFrame, least: int) -> tuple[pl.DataFrame, Tensor]:
     """
     x = pl.col("x")
     index = pl.col("index")
+    frame = pl.col("frame")
+    # All samples of one moment are a possible start.
     moment = ["scene", "frame"]
+
     # Ego vehicles come from the middle, where others are recorded on both sides.
     middle = x.quantile(0.5, "midpoint").over(moment)
-    stays = pl.col("last") - index >= least
-    # Who does not stay comes last; of two equally near the one with the lower index is first.
-    nearest = index.sort_by(pl.when("stays").then("off_middle"), index, nulls_last=True).first()
-    there = (
-        samples.with_columns(stays=stays, off_middle=(x - middle).abs())
-        .with_columns(
-            ego=nearest.over(moment), steps=pl.col("frame").max().over("scene") - pl.col("frame")
-        )
-        .filter(pl.col("stays").any().over(moment))
+    there = samples.with_columns(
+        stays=pl.col("last") - index >= least,
+        off_middle=(x - middle).abs(),
     )
+
+    # The index of the vehicle that the ego replaces. Who does not stay comes last; of two equally
+    # near the one with the lower index is first.
+    nearness = pl.when("stays").then("off_middle")
+    nearest = index.sort_by(nearness, index, nulls_last=True).first()
+    there = there.with_columns(
+        ego=nearest.over(moment),
+        steps=frame.max().over("scene") - frame,
+    )
+    there = there.filter(pl.col("stays").any().over(moment))
+
+    # Distance from the vehicle that the ego replaces, m.
     place = there["index"].to_numpy()
     ego = there["ego"].to_numpy()
-    # Distance from the vehicle that the ego replaces, which itself comes first.
     x_m = samples["x"].to_numpy()
     y_m = samples["y"].to_numpy()
     distance = np.hypot(x_m[place] - x_m[ego], y_m[place] - y_m[ego])
-    # Below every distance, so that it comes first.
+    # Below every distance, so that this vehicle itself comes first.
     distance[place == ego] = -1.0
-    there = (
-        there.with_columns(distance=distance)
-        .sort("scene", "frame", "distance", "index")
-        .with_columns(start=pl.struct(moment).rle_id(), rank=pl.int_range(pl.len()).over(moment))
-        .filter(pl.col("rank") < MOST_VEHICLES)
+
+    # Starts are numbered scene by scene in order of time, their vehicles nearest first.
+    there = there.with_columns(distance=distance)
+    there = there.sort("scene", "frame", "distance", "index")
+    there = there.with_columns(
+        start=pl.struct(moment).rle_id(),
+        rank=pl.int_range(pl.len()).over(moment),
     )
-    starts = there.filter(pl.col("rank") == 0)
+    there = there.filter(pl.col("rank") < MOST_VEHICLES)
+
     # One row per start, one column per rank.
+    starts = there.filter(pl.col("rank") == 0)
     table = np.full((len(starts), there.n_unique("rank")), -1)
     table[there["start"], there["rank"]] = there["index"]
     return starts, torch.from_numpy(table)
@@ -162,14 +186,19 @@ class ReplayTraffic(TrafficModule):
 
     visibility = Visibility.BODY
     own_roads = True
-    # [R, 8] float64, the float fields of every sample; [R] the last sample of its track.
+
+    # Of every sample: its float fields, ordered as VEHICLE_FLOATS, [R, 8] float64, and the last
+    # sample of its track, [R].
     samples: Tensor
     last: Tensor
-    # [K, P], [K], [K]: samples at the starts of episodes, steps to their ends, and their scenes.
+
+    # Of every start of an episode: the samples in its first frame, [K, P], the steps to its end,
+    # [K], and its scene, [K].
     starts: Tensor
     steps: Tensor
     scene: Tensor
-    # [S]: a scene's first start, its number of starts, and its road.
+
+    # Of every scene, [S]: its first start, its number of starts, and its road.
     first_start: Tensor
     starts_in: Tensor
     lanes: Tensor
@@ -185,8 +214,13 @@ class ReplayTraffic(TrafficModule):
         recordings: pl.DataFrame | None = None,
         roads: str | Path | None = None,
     ) -> None:
-        self.source = "recordings" if recordings is not None else str(path or _default_path())
-        frame = read_scenes(self.source) if recordings is None else recordings
+        if recordings is None:
+            self.source = str(path or _default_path())
+            frame = read_scenes(self.source)
+        else:
+            self.source = "recordings"
+            frame = recordings
+
         widths = scene_lane_widths(frame)
         samples = _with_tracks(frame, widths)
         starts, table = _starts(samples, round(least_s / FRAME_S))
@@ -195,6 +229,8 @@ class ReplayTraffic(TrafficModule):
                 f"{self.source}: no vehicle is recorded for {least_s:g} s; give longer recordings "
                 "or a smaller traffic.least_s."
             )
+
+        # Starts are sorted by scene, so those of a scene follow each other.
         names, first_start, scene, starts_in = np.unique(
             starts["scene"].to_numpy().astype(str),
             return_index=True,
@@ -202,11 +238,13 @@ class ReplayTraffic(TrafficModule):
             return_counts=True,
         )
         scene_names = tuple(names.tolist())
+
         counts = scene_lane_counts(frame)
         lanes = torch.tensor([counts[name] for name in scene_names])
         width_m = torch.tensor([widths[name] for name in scene_names], dtype=torch.float64)
         # For sizes only; the road of a row is road_of's.
-        super().__init__(Road(int(lanes.max()), float(width_m.mean())), stream)
+        road = Road(int(lanes.max()), float(width_m.mean()))
+        super().__init__(road, stream)
         self.scene_names = scene_names
         buffers = {
             "samples": _motion(samples),
@@ -220,11 +258,18 @@ class ReplayTraffic(TrafficModule):
             "lane_width_m": width_m,
             "stretches": None if roads is None else self._stretches(roads, counts),
         }
+        # Not saved with an agent or a run: they are those of the file.
         for name, tensor in buffers.items():
             self.register_buffer(name, tensor, persistent=False)
 
     def _stretches(self, path: str | Path, lanes: Mapping[str, int]) -> Tensor:
-        """Those of the scenes' lanes in the file ``path``; ``lanes`` counts them."""
+        """Where the scenes' lanes begin and end by the file ``path``, [S, 5, L].
+
+        ``lanes`` counts the lanes of every scene. Those of a scene that the file leaves out go on.
+
+        Raises:
+            UserError: the roads of other scenes or with other numbers of lanes.
+        """
         roads = read_roads(path)
         for name, stretches in roads.items():
             if name not in lanes:
@@ -237,8 +282,11 @@ class ReplayTraffic(TrafficModule):
                     f"{path}: {name}: {len(stretches)} lanes; expected the {lanes[name]} of the "
                     "recording, from the right."
                 )
-        go_on = {name: (LaneStretch(),) * count for name, count in lanes.items()}
-        of_scenes = [(go_on | roads)[name] for name in self.scene_names]
+
+        # By default a lane has no ends.
+        by_scene = {name: (LaneStretch(),) * count for name, count in lanes.items()}
+        by_scene |= roads
+        of_scenes = [by_scene[name] for name in self.scene_names]
         return torch.stack(stretches_of_roads(of_scenes), dim=1)
 
     def start_of(self, key: Tensor) -> Tensor:
@@ -246,21 +294,26 @@ class ReplayTraffic(TrafficModule):
         # First the scene, then a start in it: long scenes are not driven more often.
         # Two vehicles' numbers serve as two independent ones.
         u = uniform(key, 0, 2, [Purpose.REPLAY_START], torch.float64)[..., 0]
-        scene = _one_of(u[:, 0], torch.full_like(key, len(self.scene_names)))
-        return self.first_start[scene] + _one_of(u[:, 1], self.starts_in[scene])
+        u_scene, u_start = u.unbind(-1)
+        scene = _one_of(u_scene, torch.full_like(key, len(self.scene_names)))
+        start_in_scene = _one_of(u_start, self.starts_in[scene])
+        return self.first_start[scene] + start_in_scene
 
     def scenes_of_episodes(self, seed: int, episodes: Sequence[int]) -> list[str]:
-        """Name of the scene of each of ``episodes``, for figures by scene."""
-        scenes = self.scene[self._starts_of(seed, episodes)]
-        return [self.scene_names[number] for number in scenes.tolist()]
+        """Name of the scene of each of the ``episodes`` with ``seed``, for figures by scene."""
+        starts = self.start_of(self._keys_of(seed, episodes))
+        scenes = self.scene[starts].tolist()
+        return [self.scene_names[number] for number in scenes]
 
     def cars_of_episodes(self, seed: int, episodes: Sequence[int]) -> list[int]:
         """A number for the recorded car that the ego replaces in each of ``episodes``.
 
         Episodes of one car begin a tenth of a second apart: they are near copies of each other.
         """
+        starts = self.start_of(self._keys_of(seed, episodes))
+        replaced = self.starts[starts, 0]
         # The last sample of its track is nobody else's.
-        return self.last[self.starts[self._starts_of(seed, episodes), 0]].tolist()
+        return self.last[replaced].tolist()
 
     def episodes_once(self, seed: int, idm: IdmParameters) -> list[int]:
         """The first episode of each start that can be driven, in ascending order.
@@ -269,30 +322,37 @@ class ReplayTraffic(TrafficModule):
         would brake beyond :data:`HARD_BRAKING_MPS2` at once: the recorded driver was nearer to the
         vehicle ahead than IDM ever is, and a crash there is none of the agent's.
 
+        Args:
+            seed: of the episodes.
+            idm: the ego's.
+
         Raises:
             UserError: no start is left.
         """
-        # Scenes are equally likely, so a start of the longest scene comes once in so many episodes.
+        # Scenes are equally likely, so a start of the longest scene comes once in so many episodes:
+        # in 20 times as many hardly any start is missing.
         rarest = len(self.scene_names) * int(self.starts_in.max())
-        numbers = torch.arange(20 * rarest)
-        starts = self._starts_of(seed, numbers.tolist())
+        starts = self.start_of(self._keys_of(seed, range(20 * rarest)))
         _, first = np.unique(starts.cpu().numpy(), return_index=True)
-        numbers = numbers[torch.from_numpy(first).sort().values]
-        key = episode_key(self.stream, torch.full_like(numbers, seed), numbers).to(starts.device)
+        episodes = np.sort(first)
+
+        # What the ego alone, vehicle 0, would do in the first frame of each.
+        key = self._keys_of(seed, episodes.tolist())
         vehicles = self.scenes(MOST_VEHICLES)(key, torch.float32)
         scene = perceive(vehicles, self.road_of(key), slice(0, 1))
-        softly = following_acceleration(scene, idm)[:, 0] >= HARD_BRAKING_MPS2
-        if not softly.any():
+        acceleration = following_acceleration(scene, idm)[:, 0]
+        brakes_softly = acceleration >= HARD_BRAKING_MPS2
+        if not brakes_softly.any():
             raise UserError(
                 f"{self.source}: at every start the ego would have to brake harder than "
                 f"{-HARD_BRAKING_MPS2:g} m/s2 at once; give other recordings."
             )
-        return numbers[softly.cpu()].tolist()
+        return episodes[brakes_softly.cpu().numpy()].tolist()
 
-    def _starts_of(self, seed: int, episodes: Sequence[int]) -> Tensor:
-        """Number of the start of each of ``episodes``."""
+    def _keys_of(self, seed: int, episodes: Sequence[int]) -> Tensor:
+        """Keys [E] int64 of the ``episodes`` of this traffic's stream."""
         numbers = torch.tensor(list(episodes), dtype=torch.int64, device=self.scene.device)
-        return self.start_of(episode_key(self.stream, torch.full_like(numbers, seed), numbers))
+        return episode_key(self.stream, torch.full_like(numbers, seed), numbers)
 
     def steps_of(self, key: Tensor) -> Tensor:
         """Physics steps until the scene ends, [N] int64.
@@ -302,16 +362,26 @@ class ReplayTraffic(TrafficModule):
         return self.steps[self.start_of(key)]
 
     def road_of(self, key: Tensor, dtype: torch.dtype = torch.float32) -> Road:
-        """The road of each row: ``lanes`` [N, 1] int64, ``lane_width_m`` [N, 1], and where its
-        lanes begin and end [N, L]; x = 0 is the ego's start.
+        """The road of each row; x = 0 is the ego's start.
+
+        Args:
+            key: of the episodes, [N] int64.
+            dtype: float type of the run.
+
+        Returns:
+            A road with ``lanes`` [N, 1] int64, ``lane_width_m`` [N, 1], and where its lanes begin
+            and end [N, L].
         """
         start = self.start_of(key)
         scene = self.scene[start]
+
         stretches = None
         if self.stretches is not None:
+            # From the positions of the recording to those of the episode.
             of_scenes = RowStretches(*self.stretches[scene].unbind(1))
             ego_m = self.samples[self.starts[start, :1], _X]
             stretches = from_start(of_scenes, ego_m, dtype)
+
         return Road(
             self.lanes[scene][:, None],
             self.lane_width_m[scene][:, None].to(dtype),
@@ -319,31 +389,44 @@ class ReplayTraffic(TrafficModule):
         )
 
     def recorded(self, key: Tensor, step: Tensor, vehicles: int, dtype: torch.dtype) -> Vehicles:
-        """The vehicles [N, ``vehicles``] as recorded ``step`` [N] steps after the start; x = 0 is
-        the ego's start.
+        """The vehicles as recorded ``step`` steps after the start; x = 0 is the ego's start.
 
         A vehicle whose track has ended stays at its last position and is invalid. Entries without a
         vehicle are invalid copies of the ego's start.
+
+        Args:
+            key: of the episodes, [N] int64.
+            step: physics steps since their starts, [N] int64.
+            vehicles: M, the ego included.
+            dtype: float type of the run.
+
+        Returns:
+            Vehicles [N, M], the one that the ego replaces first.
         """
         start = self.start_of(key)
         first = self.starts[start, :vehicles]
         # Fewer vehicles than asked for: the rest of the row is invalid.
         lacking = first.new_full((len(key), vehicles - first.shape[1]), -1)
         first = torch.cat((first, lacking), dim=1)
+        is_recorded = first >= 0
+
+        # Samples follow each other in the table, so a step is one sample further.
         ego = self.starts[start, :1]
-        begin = torch.where(first >= 0, first, ego)
+        begin = torch.where(is_recorded, first, ego)
         last = self.last[begin]
         now = begin + step[:, None]
         fields = self.samples[torch.minimum(now, last)]
+
         # In float64, as far down the road as recordings go; only then in the run's float type.
         fields[..., _X] -= self.samples[ego][..., _X]
         values = dict(zip(VEHICLE_FLOATS, fields.to(dtype).unbind(-1)))
+
         lane = self.road_of(key, dtype).lane_of(values["y"]).long()
         return Vehicles(
             **values,
             target_lane=lane,
             visibility=torch.full_like(lane, int(self.visibility)),
-            valid=(first >= 0) & (now <= last),
+            valid=is_recorded & (now <= last),
         )
 
     def scenes(
@@ -352,7 +435,9 @@ class ReplayTraffic(TrafficModule):
         ego_visibility: int = Visibility.BODY,
         ego_desired_speed_mps: float = 25.0,
     ) -> RecordedScenes:
-        """The initial scenes of this traffic."""
+        """The initial scenes of this traffic; the arguments are those of
+        :class:`RecordedScenes`.
+        """
         return RecordedScenes(self, vehicles, ego_visibility, ego_desired_speed_mps)
 
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
@@ -364,10 +449,15 @@ class ReplayTraffic(TrafficModule):
 
 @dataclass(frozen=True)
 class RecordedScenes:
-    """The initial scenes of replayed episodes (:class:`ganlane.sim.scenes.Scenes`), M ``vehicles``
-    with the ego.
+    """The initial scenes of replayed episodes (:class:`ganlane.sim.scenes.Scenes`).
 
-    What is said of the ego is not known of the recorded driver.
+    Attributes:
+        traffic: that is played.
+        vehicles: M, the ego included.
+        ego_visibility: when others see the ego's lane changes
+            (:class:`~ganlane.settings.driving.Visibility`). This and what follows is not known of
+            the recorded driver.
+        ego_desired_speed_mps: of the ego.
     """
 
     traffic: ReplayTraffic
@@ -390,16 +480,16 @@ class RecordedScenes:
         """
         scene = self.traffic.recorded(key, torch.zeros_like(key), self.vehicles, dtype)
         is_ego = scene.is_ego()
-        return scene.with_(
-            desired_speed=torch.where(is_ego, self.ego_desired_speed_mps, scene.desired_speed),
-            visibility=torch.where(is_ego, int(self.ego_visibility), scene.visibility),
-        )
+        desired_speed = torch.where(is_ego, self.ego_desired_speed_mps, scene.desired_speed)
+        visibility = torch.where(is_ego, int(self.ego_visibility), scene.visibility)
+        return scene.with_(desired_speed=desired_speed, visibility=visibility)
 
 
 def _one_of(u: Tensor, count: Tensor) -> Tensor:
     """A number from 0 to ``count`` - 1, int64, from a uniform ``u`` in [0, 1)."""
+    number = (u * count).long()
     # The product may round up to count.
-    return torch.minimum((u * count).long(), count - 1)
+    return torch.minimum(number, count - 1)
 
 
 def _default_path() -> Path:

@@ -76,32 +76,40 @@ class GeneratedTraffic(TrafficModule):
         self.motions = [f"motion_{index}" for index in range(sizes.observed - 1)]
         # A purpose per latent dimension keeps them independent.
         self.purposes = [Purpose.NOISE + index for index in range(sizes.noise)]
-        # The same as the kernel's, in the run's float type.
-        memory = drivers.memory().items()
-        self.memory_fields = {
-            key[-1]: (shape, None) for key, (_, shape) in memory if key[1] == "generator"
-        }
+
+        # The same as the kernel's, in the run's float type: there the names are paths of keys, and
+        # those of the overlays are among them.
+        fields = {}
+        for path, (_, shape) in drivers.memory().items():
+            if path[1] == "generator":
+                fields[path[-1]] = (shape, None)
+        self.memory_fields = fields
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """Straight driving at the present speed, and latent vectors of this episode."""
         # Metres per step along the lane, none across.
         along = vehicles.speed * PHYSICS_STEP_S
         displacement = torch.stack([along, torch.zeros_like(along)], dim=-1)
-        history = start(in_dtype(self.generator, vehicles.x.dtype), displacement)
+        network = in_dtype(self.generator, vehicles.x.dtype)
+        history = start(network, displacement)
+
         # Step -1: before the first step of the episode.
         noise = normal(key, -1, along.shape[1], self.purposes, along.dtype)
         return {**self.remember(history), "noise": noise}
 
     def remember(self, history: History) -> Memory:
         """The history as memory; motions move on by name, without copies."""
-        return {**dict(zip(self.motions, history.motions)), "displacement": history.displacement}
+        motions = dict(zip(self.motions, history.motions))
+        return {**motions, "displacement": history.displacement}
 
     def before(self, memory: Memory, key: Tensor, step: Tensor) -> tuple[History, Tensor]:
         """The drivers' history from the memory, and the latent vectors [N, M, Z] of this step."""
+        motions = tuple(memory[name] for name in self.motions)
+        history = History(motions, memory["displacement"])
+
         # An autoregressive process: the latent vector keeps its variance and forgets slowly.
         noise = memory["noise"]
         fresh = normal(key, step, noise.shape[1], self.purposes, noise.dtype)
-        history = History(tuple(memory[name] for name in self.motions), memory["displacement"])
         return history, wander(noise, fresh, self.drivers.noise_period_s)
 
 
@@ -119,7 +127,8 @@ class SocialGanTraffic(GeneratedTraffic):
         network = in_dtype(self.generator, vehicles.x.dtype)
         history, noise = self.before(memory, key, step)
         # Scaled for the network alone: the memory keeps unit variance.
-        moved, history = paper_step(network, vehicles, history, self.drivers.noise_scale * noise)
+        latent = self.drivers.noise_scale * noise
+        moved, history = paper_step(network, vehicles, history, latent)
         return moved, {**self.remember(history), "noise": noise}
 
 
@@ -127,6 +136,7 @@ class AnchoredGanTraffic(GeneratedTraffic):
     """``traffic=gan_calibrated``: the network's residual on an anchor of IDM and lane keeping.
 
     It follows ``vehicles.target_lane``, which an overlay sets, and ``vehicles.desired_speed``.
+
     Additional memory: ``residual_mean`` [N, M, 2] in m/s2 (the washout), ``headway`` [N, M] in s.
 
     Args:
@@ -163,12 +173,21 @@ class AnchoredGanTraffic(GeneratedTraffic):
         # The washout's mean and the headway belong to the driver, as the history does.
         driver = DriverMemory(history, memory["residual_mean"], memory["headway"])
         anchor = self.drivers.anchor
+        # Drivers of this preset have one.
         assert anchor is not None
         # Scaled for the network alone: the memory keeps unit variance.
         latent = self.drivers.noise_scale * noise
-        # Where lanes end, drivers make room for those who have to leave theirs.
-        makes_room = partial(yielding, idm=self.drivers.idm, mobil=self.mobil)
-        bound = makes_room if self.road.stretches else None
+
+        bound = None
+        if self.road.stretches:
+            # Where lanes end, drivers make room for those who have to leave theirs.
+            bound = partial(yielding, idm=self.drivers.idm, mobil=self.mobil)
         moved, driver = anchored_step(network, vehicles, self.road, driver, latent, anchor, bound)
-        new_memory = {"noise": noise, "residual_mean": driver.mean, "headway": driver.headway}
-        return moved, {**self.remember(driver.history), **new_memory}
+
+        new_memory = {
+            **self.remember(driver.history),
+            "noise": noise,
+            "residual_mean": driver.mean,
+            "headway": driver.headway,
+        }
+        return moved, new_memory

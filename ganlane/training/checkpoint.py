@@ -32,28 +32,40 @@ FINITE = ("agent", "window", "stats")
 
 
 class TrainingState:
-    """State of a run of ``agent`` in ``env``, batch [N].
+    """State of a run.
 
-    ``pending_decisions`` counts decisions whose updates are still due; ``best`` is the best
-    evaluation so far, ``evaluated_at`` the decisions at the last one. ``identity`` is plain data
-    that a resumed run must share: environment, traffic, reward, seed.
+    Args:
+        env: batch [N].
+        agent: that is trained in it.
+        identity: plain data that a resumed run must share: environment, traffic, reward, seed.
+
+    Attributes:
+        environments: N.
+        decisions: made so far, over all environments.
+        pending_decisions: those of them whose updates are still due.
+        evaluated_at: decisions at the last evaluation.
+        best: mean reward of the best evaluation so far; None before the first.
     """
 
     def __init__(
         self, env: EnvBase, agent: Rainbow, identity: Mapping[str, Any] | None = None
     ) -> None:
-        # what the run consists of, in the order of a decision
+        self.identity = dict(identity or {})
+
+        # What the run consists of, in the order of a decision.
         self.collector = Collector(env)
         self.agent = agent
-        self.identity = dict(identity or {})
-        self.environments = self.collector.environments
-        gamma, actions = agent.config.gamma, agent.network.config.actions
+        gamma = agent.config.gamma
         self.window = NStepWindow(agent.config.n_step, gamma)
+        self.environments = self.collector.environments
+        actions = agent.network.config.actions
         self.stats = EpisodeStats(self.environments, actions, gamma, agent.device)
+
         self.decisions = 0
         self.pending_decisions = 0
         self.evaluated_at = 0
         self.best: float | None = None
+
         # Wall time of the run before it was resumed.
         self._before_s = 0.0
         self._started_s = time.monotonic()
@@ -65,12 +77,19 @@ class TrainingState:
 
     def progress(self) -> dict[str, Any]:
         """How far the run has come."""
-        return {"decisions": self.decisions, "updates": self.agent.updates, "wall_s": self.wall_s}
+        return {
+            "decisions": self.decisions,
+            "updates": self.agent.updates,
+            "wall_s": self.wall_s,
+        }
 
     def passed(self, every: int) -> bool:
         """Whether the last step passed a multiple of ``every`` decisions; never, for 0."""
+        if every <= 0:
+            return False
         # A step makes N decisions at once, so multiples are passed rather than met.
-        return every > 0 and self.decisions // every > (self.decisions - self.environments) // every
+        before = self.decisions - self.environments
+        return self.decisions // every > before // every
 
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
         """Tensors and plain data.
@@ -80,7 +99,7 @@ class TrainingState:
         """
         return {
             "agent": self.agent.state_dict(with_replay),
-            # None marks what a light checkpoint leaves out
+            # None marks what a light checkpoint leaves out.
             "window": self.window.state_dict() if with_replay else None,
             "env_state": self.collector.state_dict(with_replay),
             "stats": self.stats.state_dict() if with_replay else None,
@@ -102,8 +121,8 @@ class TrainingState:
         Raises:
             UserError: the checkpoint is unreadable, or of another run.
         """
-        state = load_checkpoint(path, self.agent.device)
         option = f"resume={path}"
+        state = load_checkpoint(path, self.agent.device)
         if not isinstance(state, dict) or not state.keys() >= {*PARTS}:
             raise UserError(
                 f"{option}: parts of the run are missing in it; give another checkpoint."
@@ -114,25 +133,28 @@ class TrainingState:
                     f"{option}: numbers of its {name} are not finite; give a checkpoint of "
                     "another run."
                 )
+
         try:
             self._take_over(state, option)
         except UserError:
             raise
         except Exception as error:  # damaged parts can fail in any way
+            # On one line, whatever the error says.
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise UserError(
                 f"{option}: a part of the run is damaged in it ({reason}); give another checkpoint."
             ) from error
+
         if state["agent"]["replay"] is None:
             return "the replay buffer: it is filled again before the next update"
         return None
 
     def _take_over(self, state: Mapping[str, Any], option: str) -> None:
         """Restore everything from ``state``; see :meth:`restore`."""
-        # by dotted name, as on the command line
+        # By dotted name, as on the command line.
         before = flat(state["identity"])
         now = flat(self.identity)
-        # the first difference is enough for a sentence
+        # The first difference is enough for a sentence.
         for name in (*now, *before):
             if before.get(name) != now.get(name):
                 raise UserError(
@@ -145,13 +167,15 @@ class TrainingState:
                 f"{option}: saved with environments of shape {shape}, this run has "
                 f"[{self.environments}]; use the same number."
             )
+
         self.agent.load_state_dict(state["agent"])
-        # with the window and the buffer everything goes on where it stopped
+        # With the window and the buffer everything goes on where it stopped.
         exact = state["window"] is not None
         self.collector.load_state_dict(state["env_state"], exact)
         if exact:
             self.window.load_state_dict(state["window"])
             self.stats.load_state_dict(state["stats"])
+
         counters = state["counters"]
         self.decisions = counters["decisions"]
         self.pending_decisions = counters["pending_decisions"]
@@ -162,8 +186,11 @@ class TrainingState:
 class Checkpointer:
     """Writes ``checkpoints/last.pt`` (to resume), ``last`` and ``best.safetensors`` (to drive).
 
-    ``config`` says how often, and whether with the replay buffer. To the ``metadata`` of the
-    agent's files the progress of the training is added, under ``training``.
+    Args:
+        state: of the run.
+        folder: of the run.
+        config: says how often, and whether with the replay buffer.
+        metadata: of the agent's files; the progress of the training is added, under ``training``.
     """
 
     def __init__(
@@ -190,19 +217,24 @@ class Checkpointer:
         # Weights alone, as an agent's file: it can be driven while the training goes on.
         self.save_weights("last", {})
         now = time.monotonic()
-        # a slow disk must not slow down the training
-        self.next_s = now + max(self.config.checkpoint_every_s, PATIENCE * (now - begun))
+        took_s = now - begun
+        # A slow disk must not slow down the training.
+        self.next_s = now + max(self.config.checkpoint_every_s, PATIENCE * took_s)
 
     def save_weights(self, name: str, figures: Mapping[str, Any]) -> None:
         """Write the online network as ``NAME.safetensors``, with ``figures`` in its metadata."""
-        training = {**self.metadata.get("training", {}), **self.state.progress(), **figures}
+        training = {
+            **self.metadata.get("training", {}),
+            **self.state.progress(),
+            **figures,
+        }
         metadata = {**self.metadata, "training": training}
         save_agent(self.path.with_name(f"{name}.safetensors"), self.state.agent, metadata)
 
 
 def save_checkpoint(path: str | Path, state: Any) -> None:
     """Write ``state`` (tensors and plain data) atomically, with a checksum of the whole file."""
-    # a kill while writing leaves the checkpoint before it
+    # A kill while writing leaves the checkpoint before it.
     with atomic_path(path) as part:
         torch.save({"kind": KIND, "version": VERSION, "state": state}, part)
         # The checksum goes into the comment of the archive, which torch does not read.
@@ -216,22 +248,26 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> Any
         UserError: the file is absent, damaged in any byte, or is no training checkpoint of this
             version.
     """
-    path, option = Path(path), f"resume={path}"
+    path = Path(path)
+    option = f"resume={path}"
     if not path.is_file():
         raise UserError(f"{option}: no such file; give a run's folder or its {LAST}.")
+
+    sealed = False
     with path.open("rb") as file:
         # Another file, however large, is not searched for a checksum; an empty one has no map.
-        sealed = file.read(2) == b"PK" and has_checksum(
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), option
-        )
+        if file.read(2) == b"PK":
+            archive = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            sealed = has_checksum(archive, option)
     try:
-        # weights_only: no pickled object is made, no code runs
+        # weights_only: no pickled object is made, no code runs.
         content = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # arbitrary bytes can make the unpickler fail in any way
         raise UserError(
             f"{option}: not a readable checkpoint (truncated, or not written by ganlane); give "
             "another one."
         ) from error
+
     # First the kind: a file of another program has no checksum of ours either.
     header = content if isinstance(content, dict) else {}
     if (header.get("kind"), header.get("version")) != (KIND, VERSION):

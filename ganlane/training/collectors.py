@@ -17,16 +17,23 @@ from ganlane.agents import Rainbow
 
 
 class Collector:
-    """Steps ``env``, batch [N], in this process, driven by the agent's exploring policy.
+    """Steps environments in this process, driven by the agent's exploring policy.
 
-    ``env_state`` is the TensorDict with the environments' state. TorchRL's ``Collector`` does not
-    expose it; here it is saved, so that a resumed run is exact.
+    TorchRL's ``Collector`` does not expose the state of the environments; here it is saved, so that
+    a resumed run is exact.
+
+    Args:
+        env: batch [N].
+
+    Attributes:
+        environments: N.
+        env_state: TensorDict [N], the state before the next decision.
     """
 
     def __init__(self, env: EnvBase) -> None:
         self.env = env
         self.environments = env.batch_size.numel()
-        # The state before the next decision; what has ended is begun anew within a step.
+        # What has ended is begun anew within a step.
         self.env_state: TensorDictBase = env.reset()
         # Torch's number of threads is each thread's own.
         threads = torch.get_num_threads()
@@ -41,8 +48,9 @@ class Collector:
         another thread drives at the same time.
         """
         with torch.no_grad():
-            # the policy writes its action into the state itself
+            # The policy writes its action into the state itself.
             decided = agent.policy(self.env_state)
+
         # The kernel computes without Python's lock: 100,000 decisions on gan took 38 s instead of
         # 48 s on two cores. In this context, since it holds the number of the kernel's threads.
         if agent.device.type == "cpu":
@@ -52,6 +60,7 @@ class Collector:
             # A GPU computes on its own while the next calls are made.
             outcome = partial(self._drive, decided)
         meanwhile()
+
         # The step holds each row as it ended; in env_state such rows are reset already.
         step, self.env_state = outcome()
         return step
@@ -62,8 +71,9 @@ class Collector:
 
     def state_dict(self, exact: bool) -> dict[str, Any]:
         """The state of the environments; unless ``exact``, only their episode numbers."""
-        numbers = self.env_state.select(keys.SEED, keys.EPISODE, strict=False)
-        return pack(self.env_state if exact else numbers)
+        if exact:
+            return pack(self.env_state)
+        return pack(self.env_state.select(keys.SEED, keys.EPISODE, strict=False))
 
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
         """Continue from :meth:`state_dict` of environments of the same shape.
@@ -74,7 +84,7 @@ class Collector:
         if exact:
             self.env_state = saved
         elif keys.EPISODE in saved:
-            # rows count on in steps of their number, so no episode is driven twice
+            # Rows count on in steps of their number, so no episode is driven twice.
             following = saved.get(keys.EPISODE) + self.environments
             self.env_state = self.env.reset(saved.set(keys.EPISODE, following))
         else:  # an environment without numbered episodes
@@ -83,7 +93,7 @@ class Collector:
 
 def pack(tensordict: TensorDictBase) -> dict[str, Any]:
     """A TensorDict as plain data, with its (nested) batch sizes."""
-    # plain dictionaries, which torch.load reads without executing anything
+    # Plain dictionaries, which torch.load reads without executing anything.
     leaves = {
         key: pack(value) if isinstance(value, TensorDictBase) else value
         for key, value in tensordict.items()

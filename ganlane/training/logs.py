@@ -92,17 +92,23 @@ class Logs:
         self.progress = [] if total is None else [Progress(total, decisions)]
         self.further = further
         self.of_metrics: list[Log] = [metrics, *further, *self.progress]
+
         before = read_rows(self.evaluation_file)
-        if before:  # a resumed run: remove rows beyond its checkpoint
-            CsvLog(self.evaluation_file, list(before[0]), decisions).close()
+        if before:
+            # A resumed run: remove rows beyond its checkpoint.
+            columns = list(before[0])
+            CsvLog(self.evaluation_file, columns, decisions).close()
+
+        # Decisions and time of the last row, for the rate.
         self._last = decisions
         self._last_s = monotonic()
 
     def write(self, row: Mapping[str, float]) -> None:
         """Write a row of metrics, with the decisions per second since the last one."""
-        # the rate since the last row, whatever the rows before the resume say
+        # Since the last row, whatever the rows before the resume say.
         now = monotonic()
-        rate = (row["decisions"] - self._last) / max(now - self._last_s, 1e-9)
+        interval_s = max(now - self._last_s, 1e-9)
+        rate = (row["decisions"] - self._last) / interval_s
         self._last = int(row["decisions"])
         self._last_s = now
         for log in self.of_metrics:
@@ -118,6 +124,7 @@ class Logs:
         last = int(row["decisions"]) - 1
         with closing(CsvLog(self.evaluation_file, list(row), last)) as evaluation:
             evaluation.write(row)
+
         # With a prefix, so that these figures are not mixed with those of the training.
         figures = {f"evaluation/{name}": value for name, value in row.items()}
         for log in self.further:
@@ -151,21 +158,26 @@ class CsvLog:
 
     def __init__(self, path: str | Path, columns: Sequence[str], decisions: int = 0) -> None:
         self.path = Path(path)
-        # rows after the checkpoint are made again
+        # Rows after the checkpoint are made again.
         rows = [row for row in read_rows(self.path) if float(row["decisions"]) <= decisions]
-        form: Any = {"fieldnames": columns, "extrasaction": "ignore", "lineterminator": "\n"}
+        form: Any = {
+            "fieldnames": columns,
+            "extrasaction": "ignore",
+            "lineterminator": "\n",
+        }
         with atomic_path(self.path) as part, part.open("w", newline="") as file:
-            # the columns of today, even if the old file had others
+            # The columns of today, even if the old file had others.
             writer = csv.DictWriter(file, **form)
             writer.writeheader()
             writer.writerows(rows)
+
         # Opened anew, since the rewritten file has taken the place of the old one.
         self._file = self.path.open("a", newline="")
         self._writer = csv.DictWriter(self._file, **form)
 
     def write(self, row: Mapping[str, float]) -> None:
         """Append one line."""
-        # six digits are enough to plot, and a fraction of the size
+        # Six digits are enough to plot, and a fraction of the size.
         short = {
             name: format(value, ".6g") if isinstance(value, float) else value
             for name, value in row.items()
@@ -191,16 +203,19 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return []
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            # the last line may be cut off
+            # The last line may be cut off.
             whole = [line for line in file if line.endswith("\n")]
+
         # DictReader gives missing entries of a short row as None, and surplus ones of a long row
         # under the key None.
         reader = csv.DictReader(whole)
         rows = [row for row in reader if None not in row and None not in row.values()]
         if whole and "decisions" not in (reader.fieldnames or ()):
             raise ValueError("it has no column 'decisions'")
+
         rows = [row for row in rows if row["decisions"]]
         for row in rows:
+            # Every entry has to be a number, or empty.
             numbers = {name: float(value) for name, value in row.items() if value}
             if not 0.0 <= numbers["decisions"] < float("inf"):
                 raise ValueError(f"decisions={row['decisions']}")
@@ -241,18 +256,21 @@ class Progress:
 
     def write(self, row: Mapping[str, float]) -> None:
         """Show a row of figures."""
-        # a row without ended episodes lacks some of them
+        # A row without ended episodes lacks some of them.
         self.figures |= row
-        shown = [
-            form.format(self.figures[name]) for name, form in SHOWN.items() if name in self.figures
-        ]
+        shown = []
+        for name, form in SHOWN.items():
+            if name in self.figures:
+                shown.append(form.format(self.figures[name]))
         if not self._bar.disable:
             self._bar.set_postfix_str(", ".join(shown))
             return
+
         # The bound avoids a division by 0 where there is no rate yet.
         rate = max(row.get("decisions_per_s", 0.0), 1e-9)
-        # remaining time at the rate of the last interval
-        left = timedelta(seconds=round(max(self.total - row["decisions"], 0.0) / rate))
+        # Remaining time at the rate of the last interval.
+        decisions_left = max(self.total - row["decisions"], 0.0)
+        left = timedelta(seconds=round(decisions_left / rate))
         head = f"{int(row['decisions']):,} of {self.total:,} decisions, {rate:,.0f}/s, {left} left"
         print(", ".join([head, *shown]), file=sys.stderr, flush=True)
 
@@ -325,9 +343,10 @@ class WandbLog:
         wandb = _module("wandb", "wandb")
         mode = os.environ.get("WANDB_MODE") or "offline"
         folder = Path(folder)
-        # else W&B falls back to a temporary folder
+        # Else W&B falls back to a temporary folder.
         folder.mkdir(parents=True, exist_ok=True)
         name = "/".join(folder.absolute().parts[-2:])
+
         try:
             # W&B's console would capture the stream of the progress bar.
             settings = wandb.Settings(console="off")

@@ -31,9 +31,11 @@ STOPPING = (signal.SIGINT, signal.SIGTERM)
 class TrainingResult:
     """Result of a run.
 
-    ``progress`` has ``decisions``, ``updates`` and ``wall_s``. ``stopped_by`` is the number of the
-    signal that stopped it early, or None. ``best`` is the mean reward of the best evaluation.
-    ``checkpoint`` is the file to resume from.
+    Attributes:
+        progress: ``decisions``, ``updates`` and ``wall_s``, the seconds that it took.
+        best: mean reward of the best evaluation; None without evaluations.
+        stopped_by: number of the signal that stopped it early; None: it came to its end.
+        checkpoint: the file to resume from.
     """
 
     progress: dict[str, Any]
@@ -52,15 +54,16 @@ def noted_signals() -> Iterator[list[int]]:
     noted: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:
-        # the second Ctrl-C of someone who cannot wait
+        # The second Ctrl-C of someone who cannot wait.
         if noted and number == signal.SIGINT:
             raise KeyboardInterrupt
         noted.append(number)
 
-    # signals can be handled in the main thread alone
+    # Signals can be handled in the main thread alone.
     previous = {}
     if threading.current_thread() is threading.main_thread():
         previous = {number: signal.signal(number, note) for number in STOPPING}
+
     try:
         yield noted
     finally:
@@ -104,19 +107,21 @@ def train(
         UserError: the checkpoint is unreadable or of another run.
     """
     state = TrainingState(env, agent, identity)
-    # None: everything could be restored
+    # None: everything could be restored.
     missing = None if resume is None else state.restore(resume)
     saver = Checkpointer(state, run_folder, config, metadata or {})
+
     actions = agent.network.config.actions
     shown = config.total_decisions if config.logger.progress else None
-    # logs are closed, and their last rows written, whatever ends the run
+    # Logs are closed, and their last rows written, whatever ends the run.
     with closing(Logs(run_folder, actions, state.decisions, shown, logs)) as log:
         if missing is not None:
             log.say(f"resumed without {missing}; not bit-exact")
         if state.decisions == 0:
             saver.save()  # a run that is killed at any time can be resumed
+
         with noted_signals() as signals:
-            # a signal ends the run between two decisions
+            # A signal ends the run between two decisions.
             while state.decisions < config.total_decisions and not signals:
                 advance(state)
                 log.advance(state.decisions)
@@ -126,10 +131,12 @@ def train(
                     keep_best(state, evaluate, log, saver)
                 if saver.due():
                     saver.save()
-            # the last agent is evaluated too, unless that has just been done
+
+            # The last agent is evaluated too, unless that has just been done.
             if evaluate is not None and not signals and state.evaluated_at < state.decisions:
                 keep_best(state, evaluate, log, saver)
             saver.save()
+
     stopped_by = signals[-1] if signals else None
     return TrainingResult(state.progress(), state.best, stopped_by, saver.path)
 
@@ -146,7 +153,9 @@ def advance(state: TrainingState) -> TensorDictBase:
     step = state.collector.step(agent, partial(learn, state))
     state.decisions += state.environments
     state.stats.step(step)
+    # The window gives the transitions of n - 1 steps ago.
     agent.store(state.window.push(step))
+
     # Nothing becomes due until the buffer holds enough (``warmup``).
     if agent.ready:
         state.pending_decisions += state.environments
@@ -156,11 +165,12 @@ def advance(state: TrainingState) -> TensorDictBase:
 def learn(state: TrainingState) -> None:
     """Make the updates that are due, one per ``decisions_per_update``."""
     agent = state.agent
+    per_update = agent.config.decisions_per_update
     # A light checkpoint leaves decisions that are due and an empty buffer. Decisions that do not
     # fill an update are kept for the next step.
-    while agent.ready and state.pending_decisions >= agent.config.decisions_per_update:
+    while agent.ready and state.pending_decisions >= per_update:
         state.stats.update(agent.update())
-        state.pending_decisions -= agent.config.decisions_per_update
+        state.pending_decisions -= per_update
 
 
 def metrics(state: TrainingState) -> dict[str, float]:
@@ -176,10 +186,11 @@ def metrics(state: TrainingState) -> dict[str, float]:
 
 def keep_best(state: TrainingState, evaluate: Evaluate, log: Logs, saver: Checkpointer) -> None:
     """Evaluate the greedy policy; save it if it is the best so far."""
-    # noted first: an evaluation is not repeated at the end
+    # Noted first: an evaluation is not repeated at the end.
     state.evaluated_at = state.decisions
     row = dict(evaluate(state.agent.greedy))
     log.write_evaluation({"decisions": state.decisions, **row})
+
     reward = row["mean_reward"]
     if state.best is None or reward > state.best:
         state.best = reward

@@ -57,17 +57,20 @@ class Phase:
 def phases_of(config: TrainConfig, folder: Path) -> list[Phase]:
     """The phases of ``config``, in order."""
     start = config.init.path
-    before = config.pretrain
-    # one phase unless another is asked for
-    if before.total_decisions == 0 or before.traffic is None:
+    pretrain = config.pretrain
+    # One phase unless another is asked for.
+    if pretrain.total_decisions == 0 or pretrain.traffic is None:
         return [Phase("train", folder, config, start)]
-    # the second phase starts from the agent that the first one leaves
-    first = replace(config, traffic=before.traffic, total_decisions=before.total_decisions)
-    place = folder / "pretrain"
-    return [
-        Phase("pretrain", place, first, start),
-        Phase("train", folder, config, str(place / AGENT_FILE)),
-    ]
+
+    # The second phase starts from the agent that the first one leaves.
+    first_config = replace(
+        config,
+        traffic=pretrain.traffic,
+        total_decisions=pretrain.total_decisions,
+    )
+    first = Phase("pretrain", folder / "pretrain", first_config, start)
+    second = Phase("train", folder, config, str(first.folder / AGENT_FILE))
+    return [first, second]
 
 
 def length_if_finished(phase: Phase) -> dict[str, float] | None:
@@ -79,11 +82,13 @@ def length_if_finished(phase: Phase) -> dict[str, float] | None:
     path = phase.folder / AGENT_FILE
     if phase.name != "pretrain" or not path.is_file():
         return None
-    # the file is written at the end of the phase, with its length
-    training = read_agent(path)[2]["training"]
+
+    # The file is written at the end of the phase, with its length.
+    _, _, metadata = read_agent(path)
+    training = metadata["training"]
     done = training["decisions"]
     wanted = phase.config.total_decisions
-    # the last step of all environments may go beyond it
+    # The last step of all environments may go beyond it.
     if not wanted <= done < wanted + phase.config.num_envs:
         raise UserError(
             f"pretrain.total_decisions={wanted}: this phase is over, after {done} decisions; "
@@ -99,26 +104,31 @@ def length_if_finished(phase: Phase) -> dict[str, float] | None:
 def run_phase(phase: Phase, resume: str | Path | None = None) -> TrainingResult:
     """Train the agent of one phase and write its :data:`AGENT_FILE`.
 
-    Nothing is written if a signal stopped it early. ``resume`` is a checkpoint to continue from.
+    Nothing is written if a signal stopped it early.
+
+    Args:
+        phase: that is run.
+        resume: checkpoint to continue from; None: from the start.
 
     Raises:
         UserError: the agent to start from, the weights of the traffic or the checkpoint do not fit.
     """
-    config, folder = phase.config, phase.folder
+    config = phase.config
     agent = make_initial_agent(phase, resume is not None)
     metadata = describe(phase)
+    make = env_maker(config, Stream.TRAIN)
     result = train(
-        env_maker(config, Stream.TRAIN)(config.num_envs),
+        make(config.num_envs),
         agent,
         config,
-        folder,
+        phase.folder,
         evaluate=make_selection(config) if config.evaluate_every else None,
-        logs=make_logs(config.logger, folder, metadata),
+        logs=make_logs(config.logger, phase.folder, metadata),
         metadata=metadata,
         resume=resume,
         identity=identity(config),
     )
-    # a phase that was stopped is not over
+    # A phase that was stopped is not over.
     if result.stopped_by is None:
         save_final_agent(agent, phase, metadata, result)
     return result
@@ -129,25 +139,27 @@ def run_phase(phase: Phase, resume: str | Path | None = None) -> TrainingResult:
 
 def env_maker(config: TrainConfig, stream: Stream) -> Callable[..., EnvBase]:
     """What makes any number of environments, on the episodes of ``stream``."""
-    return partial(make_env, make_traffic(config.traffic, config.env, stream), config)
+    traffic = make_traffic(config.traffic, config.env, stream)
+    return partial(make_env, traffic, config)
 
 
 def make_selection(config: TrainConfig) -> Evaluate:
     """A function that evaluates the greedy policy on episodes that are never trained on."""
     make = env_maker(config, Stream.SELECT)
     env = make(min(config.selection_episodes, config.evaluation.num_envs))
-    # the same episodes in every call, so that figures can be compared
+    # The same episodes in every call, so that figures can be compared.
     episodes = range(config.selection_episodes)
 
     def evaluate(policy: GreedyPolicy) -> dict[str, float]:
+        # A row per episode.
         table = run_episodes(env, policy, episodes, config.seed, make_smaller=make)
         crashed = pl.col("reason") == "hard_crash"
         total = table.select("reward", "lane_changes", "distance_m", crashed).sum()
         reward, changes, distance_m, crashes = map(float, total.row(0))
-        # of the mean reward over the episodes
         spread = float(np.std(table["reward"].to_numpy()))
         return {
             "mean_reward": reward / table.height,
+            # Of the mean reward over the episodes.
             "standard_error": spread / math.sqrt(table.height),
             "crash_rate": crashes / table.height,
             # At least 1 m: all episodes may end at once.
@@ -170,18 +182,22 @@ def make_agent(phase: Phase) -> Rainbow:
     """A new agent; one that will get trained weights explores little."""
     config = phase.config
     actions = config.env.actions
-    # a falling learning rate reaches its end with the phase
+    # A falling learning rate reaches its end with the phase.
     options = config.agent.for_phase(config.total_decisions)
     # Trained weights need no long phase of random actions.
     if phase.start is not None:
-        options = replace(options, epsilon_start=min(options.epsilon_start, options.epsilon))
+        epsilon_start = min(options.epsilon_start, options.epsilon)
+        options = replace(options, epsilon_start=epsilon_start)
+
+    size = observation_size(config.observation.form, config.env.vehicles, actions)
+    legal = partial(legal_actions, road=config.env.road(), actions=actions)
     return Rainbow(
         options,
-        observation_size(config.observation.form, config.env.vehicles, actions),
+        size,
         len(actions.names),
         seed=config.seed,
         device=config.device,
-        legal=partial(legal_actions, road=config.env.road(), actions=actions),
+        legal=legal,
         compile=config.compiles(),
     )
 
@@ -195,11 +211,14 @@ def make_initial_agent(phase: Phase, resumes: bool) -> Rainbow:
         UserError: the agent to start from is missing, cannot be read, or does not fit.
     """
     agent = make_agent(phase)
-    if phase.start is not None and not resumes:
-        name = start_file(phase.start)
-        weights, network, metadata = read_agent(name)
-        check_observation(name, reading_of(metadata).observation, phase.config.observation)
-        warm_start(agent, name, weights, network)
+    if phase.start is None or resumes:
+        return agent
+
+    name = start_file(phase.start)
+    weights, network, metadata = read_agent(name)
+    trained = reading_of(metadata).observation
+    check_observation(name, trained, phase.config.observation)
+    warm_start(agent, name, weights, network)
     return agent
 
 
@@ -207,7 +226,7 @@ def check_observation(
     name: str, trained: ObservationConfig, observation: ObservationConfig
 ) -> None:
     """Raise :class:`UserError` if the agent ``name`` was ``trained`` on another observation."""
-    # what the trained agent reads of this observation, key by key
+    # What the trained agent reads of this observation, key by key.
     configured = asdict(observation)
     for key, value in asdict(observation.read_by(trained)).items():
         if value != configured[key]:
@@ -227,18 +246,22 @@ def save_final_agent(
     selection stream.
     """
     training = metadata["training"]
+    final = {**metadata, "training": {**training, **result.progress}}
+
+    # The best agent replaces the last one.
     best = phase.folder / "checkpoints" / "best.safetensors"
-    further = {}
-    # the best agent replaces the last one
     if result.best is not None and best.is_file():
         weights, _, saved = read_agent(best)
         load_parameters(agent.network, weights)
-        # what the evaluation added to the metadata of the best agent
+        # What the evaluation added to the metadata of the best agent.
         figures = {name: value for name, value in saved["training"].items() if name not in training}
-        episodes = phase.config.selection_episodes
-        further = {"selected": {**figures, "episodes": episodes, "stream": "select"}}
-    metadata = {**metadata, "training": {**training, **result.progress}, **further}
-    save_agent(phase.folder / AGENT_FILE, agent, metadata)
+        final["selected"] = {
+            **figures,
+            "episodes": phase.config.selection_episodes,
+            "stream": "select",
+        }
+
+    save_agent(phase.folder / AGENT_FILE, agent, final)
 
 
 # --- metadata

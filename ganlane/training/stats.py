@@ -19,9 +19,19 @@ RATES = {
     "out_of_road": "out_of_road_rate",
     "timeout": "timeout_rate",
 }
-#: Sums over the running episode of each environment; ``to_go`` sums the discounted returns from
-#: each of its decisions on, ``values`` what the policy expected of them.
-RUNNING = ("returns", "discounted", "to_go", "lengths", "values")
+#: Sums over the running episode of each environment.
+RUNNING = (
+    "returns",
+    # As seen from the first decision.
+    "discounted",
+    # The discounted returns from each of its decisions on, all of them together.
+    "to_go",
+    "lengths",
+    # What the policy expected of these decisions.
+    "values",
+)
+#: What :meth:`EpisodeStats.state_dict` holds.
+_STATE = ("running", "discount", "weight", "sums", "updates", "update_count")
 
 
 class EpisodeStats:
@@ -40,6 +50,11 @@ class EpisodeStats:
         actions: A, for the shares of the actions.
         gamma: discount per decision.
         device: of the sums.
+
+    Attributes:
+        running: sums over the running episodes (:data:`RUNNING`), [N] each.
+        sums: over the finished episodes since the last :meth:`read`, 0-dim; of ``actions`` [A].
+        updates: sums over the updates since then, 0-dim, and ``update_count``, their number.
     """
 
     def __init__(
@@ -58,37 +73,50 @@ class EpisodeStats:
 
     @torch.no_grad()
     def step(self, step: TensorDictBase) -> None:
-        """Add one step of the environments, batch [N]; the episodes that end are summed up."""
+        """Add one step of the environments, batch [N]; the episodes that end are summed up.
+
+        Args:
+            step: with ``action`` [N], and ``next`` with ``reward`` and ``done`` [N, 1]. Where they
+                are written also ``chosen_action_value`` [N, 1], and of ``next`` ``events`` and
+                ``ego``: these are totals of the episode so far.
+        """
         after = step.get("next")
         reward = after.get("reward").squeeze(-1)
         done = after.get("done").squeeze(-1)
+        chosen_value = step.get(keys.CHOSEN_VALUE, None)
+
         running = self.running
         running["returns"] += reward
         running["discounted"] += self.discount * reward
         running["to_go"] += self.weight * reward
         running["lengths"] += 1.0
-        chosen = step.get(keys.CHOSEN_VALUE, None)
-        if chosen is not None:
-            running["values"] += chosen.reshape(-1)
+        if chosen_value is not None:
+            running["values"] += chosen_value.reshape(-1)
         self.discount *= self.gamma
         # The next reward counts fully for the next decision, gamma times as much for those before.
         self.weight = 1.0 + self.gamma * self.weight
 
+        # [N, A]: which action each environment took.
         taken = step.get(keys.ACTION)[:, None] == self.actions
         self._add("actions", taken.sum(0))
         self._add("episodes", done.sum())
+
+        # What counts only at the end of an episode: its sums, how it ended, how far it went.
         at_end = dict(running)
-        if chosen is None:
+        if chosen_value is None:
             del at_end["values"]
         events = after.get(keys.EVENTS, {})
-        at_end |= {name: events.get(name).squeeze(-1) for name in RATES if name in events}
+        for name in RATES:
+            if name in events:
+                at_end[name] = events.get(name).squeeze(-1)
         ego = after.get(keys.EGO, None)
         if ego is not None:
-            at_end |= {name: ego.get(name) for name in ("distance", "lane_changes")}
+            at_end["distance"] = ego.get("distance")
+            at_end["lane_changes"] = ego.get("lane_changes")
         for name, value in at_end.items():
             self._add(name, (value * done).sum())
 
-        # episodes that have ended begin anew
+        # Episodes that have ended begin anew.
         going = ~done
         for name, value in running.items():
             running[name] = value * going
@@ -96,47 +124,64 @@ class EpisodeStats:
         self.weight = torch.where(done, 1.0, self.weight)
 
     def update(self, metrics: Mapping[str, Tensor]) -> None:
-        """Add the 0-dim ``metrics`` of one update."""
-        # summed on the device, without waiting for it
+        """Add the metrics of one update.
+
+        Args:
+            metrics: 0-dim tensors by name, on any device.
+        """
+        # Summed on the device, without waiting for it.
         self.update_count += 1
         for name, value in metrics.items():
             self.updates[name] = self.updates.get(name, 0.0) + value
 
     def _add(self, name: str, value: Tensor) -> None:
+        """Add ``value`` to the sum of this name."""
+        # In double precision: an interval may have millions of steps.
         self.sums[name] = self.sums.get(name, 0.0) + value.double()
 
     def read(self) -> dict[str, float]:
         """Means since the last call; resets the sums.
 
-        What would be a mean over no episode or no update is left out.
+        Returns:
+            Figures by their columns in ``metrics.csv``. What would be a mean over no episode or no
+            update is left out.
         """
-        # one copy from the device for each sum, and none between two calls
+        # One copy from the device for each sum, and none between two calls.
         sums: dict[str, Any] = {name: value.tolist() for name, value in self.sums.items()}
         row = {name: float(value) / self.update_count for name, value in self.updates.items()}
+        self.sums = {}
+        self.updates = {}
+        self.update_count = 0
+
         taken = sums.pop("actions", [])
+        actions = max(sum(taken), 1)
         for i, count in enumerate(taken):
-            row[f"action_{i}_share"] = count / max(sum(taken), 1)
-        self.sums, self.updates, self.update_count = {}, {}, 0
-        episodes = row["episodes"] = sums.get("episodes", 0.0)
+            row[f"action_{i}_share"] = count / actions
+
+        episodes = sums.get("episodes", 0.0)
+        row["episodes"] = episodes
         if episodes == 0.0:
             return row
         row["mean_return"] = sums["returns"] / episodes
         row["mean_discounted_return"] = sums["discounted"] / episodes
+
+        # These two are means over decisions, so that they can be compared.
         decisions = max(sums["lengths"], 1.0)
         row["mean_return_to_go"] = sums["to_go"] / decisions
         if "values" in sums:
             row["mean_value"] = sums["values"] / decisions
+
         for name, column in RATES.items():
             if name in sums:
                 row[column] = sums[name] / episodes
         if sums.get("distance", 0.0) > 0.0:
+            # The distance is in metres.
             row["lane_changes_per_km"] = 1000.0 * sums["lane_changes"] / sums["distance"]
         return row
 
     def state_dict(self) -> dict[str, Any]:
         """Sums of the running episodes and of the current interval."""
-        names = ("running", "discount", "weight", "sums", "updates", "update_count")
-        return {name: deepcopy(getattr(self, name)) for name in names}
+        return {name: deepcopy(getattr(self, name)) for name in _STATE}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore :meth:`state_dict`."""

@@ -146,7 +146,8 @@ def evaluate(
         agents: names, drivers from :func:`load_agent`, policies or functions of your own, as in
             :func:`benchmark`; ``mobil`` and ``random_legal`` are needed for the normalised score.
         traffics: options as in :func:`make_env`, or a mapping that gives them names of your own.
-        episodes: the episodes 0 to ``episodes - 1`` of the seed, on the stream kept for reports.
+        episodes: the episodes 0 to ``episodes - 1`` of the seed, on the stream kept for reports; of
+            ``replay`` the first ones that drive each recorded start once.
         per_episode: one row per episode instead (:func:`ganlane.evaluation.run_episodes`).
         keys: ``seed``, options (``env``, ``reward``; ``observation`` and ``mask`` for policies that
             name none), keys of the command (``num_envs``, ``device``, ``stream``) or of the

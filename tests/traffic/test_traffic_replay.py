@@ -204,6 +204,12 @@ def test_starts_at_which_the_ego_would_brake_hard_at_once_are_left_out():
     assert set(traffic.scenes_of_episodes(0, episodes)) == {"long", "short"}
 
 
+def test_recordings_in_which_the_ego_always_brakes_hard_at_once_are_refused():
+    traffic = replay(*two("close", 30, 7.0, 15.0))
+    with pytest.raises(UserError, match=r"harder than 4 m/s2 at once; give other recordings\.$"):
+        traffic.episodes_once(0, IdmParameters())
+
+
 def test_episodes_of_one_recorded_car_are_known_by_its_number():
     traffic = replay(*STEADY)
     episodes = traffic.episodes_once(0, IdmParameters())

@@ -12,6 +12,7 @@ from scipy.stats import chisquare
 
 from ganlane import keys
 from ganlane.data import sort
+from ganlane.errors import UserError
 from ganlane.settings.driving import IdmParameters, Visibility
 from ganlane.sim.collisions import ego_overlaps
 from ganlane.traffic import ReplayTraffic

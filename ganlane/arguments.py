@@ -111,8 +111,7 @@ def _makes(target: Any, base: type) -> bool:
         annotation = target.__annotations__.get("return")
         returned = SimpleNamespace(__annotations__={"return": annotation})
         try:
-            names = inspect.unwrap(target).__globals__
-            target = get_type_hints(returned, names)["return"]
+            target = get_type_hints(returned, inspect.unwrap(target).__globals__)["return"]
         except Exception:  # an annotation may be any expression
             return False
     return inspect.isclass(target) and issubclass(target, base)

@@ -45,8 +45,7 @@ def save_weights(
         "ganlane": json.dumps({"kind": kind, **metadata}),
         "checksum": PLACE,
     }
-    content = save(flat, metadata=header)
-    write_bytes(path, sealed(content))
+    write_bytes(path, sealed(save(flat, metadata=header)))
 
 
 def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -42,9 +42,8 @@ class NativeRows(Rows):
         self.config = batch.config
         self.episode = self.config.env.episode_parameters()
 
-        size = batch.observation.shape[1]
-        largest = batch.bounds[1]
-        self.space = observation_space(size, largest)
+        _, largest = batch.bounds
+        self.space = observation_space(batch.observation.shape[1], largest)
 
         # No recorded scene is driven by the kernel, so none can end.
         self._no_end = np.zeros(self.count, np.bool_)

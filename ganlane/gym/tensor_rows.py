@@ -57,7 +57,7 @@ class TensorRows(Rows):
         self.episode = base.episode
 
         size = self.env.observation_spec[keys.OBSERVATION].shape[-1]
-        # One form counts metres of overlap, so its bound follows from the longest vehicle.
+        # Some forms count metres of overlap, so their bound follows from the longest vehicle.
         largest = largest_number(config.observation.form, base.scenes.longest_m)
         self.space = observation_space(size, largest)
 

@@ -47,15 +47,20 @@ _ROW_ARRAYS: dict[Key, str] = {
     "recycles": "bool",
     "fresh": "bool",
 }
+
 # What a function of the kernel reads, in the order of its structure in C++. The ego perceives all
 # vehicles as they are: of what it sees and of what there is the view reads the same arrays.
 _VIEWS = (
-    *within(keys.VEHICLES, f"{settings.VIEWED_EGO} {settings.VIEWED}"),
+    *within(keys.VEHICLES, settings.VIEWED_EGO),
+    *within(keys.VEHICLES, settings.VIEWED),
     *within(keys.EGO, "change_progress change_direction"),
     *within(keys.VEHICLES, "x heading"),
     settings.SET_SPEED,
 )
-_MASKS = (*within(keys.VEHICLES, settings.MASKED), (keys.EGO, "change_direction"))
+_MASKS = (
+    *within(keys.VEHICLES, settings.MASKED),
+    (keys.EGO, "change_direction"),
+)
 
 
 class _Batch(settings.Structure):
@@ -124,10 +129,18 @@ class NativeBatch:
         variant: one of :data:`ganlane.native.library.VARIANTS`; None: the best for this processor.
 
     Attributes:
+        rows: N.
+        terms: names of the reward's terms.
+        bounds: of the observation's numbers but the first, which is from 0 to
+            :data:`SPEED_RATIO_LIMIT`.
         state: the environment's state (:mod:`ganlane.keys`) as arrays by key, ``("vehicles", "x")``
             [N, M], ``("ego", "distance")`` and the rest [N].
+        observation: [N, D] float32.
+        mask: the actions allowed now, [N, A] bool; [N, 0] where actions are not numbered.
         time_s: since the start of the episode [N].
-        lane: that the ego is in [N], from 0 at the right.
+        lane: that the ego is in [N], from 0 at the right; of an ego off the road the outer one.
+
+    All arrays are made once. :meth:`start`, :meth:`restart` and :meth:`step` overwrite them.
 
     Raises:
         UserError: the kernel cannot be built here.
@@ -151,11 +164,12 @@ class NativeBatch:
         )
 
         # Bounds of the observation's numbers; some count metres of the longest vehicle.
+        form = config.observation.form
         scene = env.scenes()
         longest_m = env.spawn_parameters().longest_m if scene is None else scene.longest_m
-        self.bounds = (-1.0, largest_number(config.observation.form, longest_m))
+        self.bounds = (-1.0, largest_number(form, longest_m))
 
-        view = settings.view_of(self._highway, config.observation, config.observation.form)
+        view = settings.view_of(self._highway, config.observation, form)
         self._make_arrays(drivers, view.numbers())
 
         # Few rule-driven rows are quicker in narrow vectors. A network fills the widest ones with
@@ -220,7 +234,6 @@ class NativeBatch:
         config = self.config
         highway = self._highway
         abort = config.env.ego.abort_lane_change
-        commands_speed = highway.actions.form == LANE_SPEED
 
         reward = vars(config.reward) | {
             "decision_period_s": config.env.episode_parameters().decision_period_s,
@@ -242,12 +255,12 @@ class NativeBatch:
             "fastest": SPEED_RATIO_LIMIT,
             "lowest": self.bounds[0],
             "highest": self.bounds[1],
-            # The mask, also where the ego is commanded a speed.
+            # The mask, of the paper's actions and with those of the speed.
             "mask_settings": mask_settings(highway, drivers.idm, config.mask, abort),
             "mask_inputs": self._pointers(_MASKS),
             "mask_outputs": addresses([self._lane_mask, self._no_safe_action]),
             "mask": self._lane_mask,
-            "speed_mask": self.mask if commands_speed else None,
+            "speed_mask": self.mask if highway.actions.form == LANE_SPEED else None,
             "mask_form": MASKS.index(config.mask.form),
             "abort_lane_change": abort,
             # Of gymnasium's info.
@@ -287,7 +300,7 @@ class NativeBatch:
             env.mobil,
         )
 
-        # A single part drives all rows, which the kernel takes a null pointer for.
+        # A single part drives all rows: the kernel gets a null pointer in place of a list.
         row_list = np.zeros(self.rows, np.int64) if len(self._turns) > 1 else None
         layout = Layout(part.memory, highway)
         specific = {

@@ -161,7 +161,7 @@ class RuleDrivers:
         arrays = {"steering": _NUMBER}
         if self.random is not None:
             arrays["traits"] = _numbers(_TRAITS)
-            # Their last accelerations, as many as the slowest driver needs to react late.
+            # The accelerations decided last, as many as the longest reaction takes steps.
             longest_steps = _steps(self.random.reaction_s[1])
             if longest_steps:
                 arrays["past"] = _numbers(longest_steps)
@@ -529,7 +529,7 @@ def _faults_of(faults: DriverFaults) -> _Faults:
 def chance_in_step(per_hour: float) -> float:
     """Of at least one event of a Poisson process within a step."""
     events_in_step = per_hour * keys.PHYSICS_STEP_S / 3600.0
-    # 1 - exp(-events), without the rounding of a number so near to 1.
+    # 1 - exp(-events), without the rounding near 1.
     return -math.expm1(-events_in_step)
 
 
@@ -721,7 +721,7 @@ def _packed(layers: list[_Layer], weights: Weights) -> Floats:
     numbers = np.concatenate([_filled_up(layer, weights) for layer in layers])
 
     # NumPy aligns to 16 bytes, a vector has up to 64: 16 numbers of 4 bytes. With room for so many
-    # more they begin at the first address that is a multiple.
+    # more, they begin at the first address in it that is a multiple of 64.
     room = np.empty(len(numbers) + _WIDEST, np.float32)
     start = -room.ctypes.data % 64 // 4
     aligned = room[start : start + len(numbers)]

@@ -464,8 +464,7 @@ def in_threads(
             for start in range(share, rows, share)
         ]
         # This thread does not wait idle.
-        code = call(0, share)
-        code = max(code, *(other.result() for other in others))
+        code = max(call(0, share), *(other.result() for other in others))
 
     if code == 2:
         raise ValueError("an action is not 0, 1 or 2")

@@ -174,15 +174,13 @@ class Layout:
         steering = next((name for name in memory if name[-1] == "steering"), STEERING)
         further = [name for name in memory if name != steering]
 
-        inputs = [steering if name == STEERING else name for name in INPUTS]
-        self.inputs = inputs + further
+        self.inputs = [steering if name == STEERING else name for name in INPUTS] + further
 
         places: dict[Key, Key] = {STEERING: steering}
         if highway.flow is None:
             # The place of no array: a null pointer.
             places[VALID] = "valid"
-        outputs = [places.get(name, name) for name in OUTPUTS]
-        self.outputs = outputs + further
+        self.outputs = [places.get(name, name) for name in OUTPUTS] + further
 
         self.written = [name for name in self.outputs if name in self.kinds]
 

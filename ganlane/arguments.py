@@ -27,6 +27,7 @@ def whole_number(name: str, value: Any, low: int, high: int) -> int:
         number = operator.index(value)
     except TypeError:
         number = low - 1  # out of range, so refused
+
     # Python counts True as 1; as a seed or a number it is a mistake.
     if isinstance(value, bool) or not low <= number <= high:
         # Written as a power, since nobody recognises 9223372036854775807.
@@ -107,7 +108,8 @@ def _makes(target: Any, base: type) -> bool:
         if not inspect.isfunction(target):
             return False
         # Only the annotation of the result is resolved: others may name what is not imported.
-        returned = SimpleNamespace(__annotations__={"return": target.__annotations__.get("return")})
+        annotation = target.__annotations__.get("return")
+        returned = SimpleNamespace(__annotations__={"return": annotation})
         try:
             target = get_type_hints(returned, inspect.unwrap(target).__globals__)["return"]
         except Exception:  # an annotation may be any expression
@@ -123,13 +125,15 @@ def signature_of(target: Callable[..., Any]) -> inspect.Signature:
     """
     if not inspect.isclass(target):
         return inspect.signature(target)
-    # the first class that has either, as Python from 3.11.4 on looks them up
+
+    # The first class that has either, as Python from 3.11.4 on looks them up.
     for ancestor in target.__mro__[:-1]:
         for name in ("__init__", "__new__"):
             if name in vars(ancestor):
                 signature = inspect.signature(getattr(ancestor, name))
-                # without self or cls
-                return signature.replace(parameters=list(signature.parameters.values())[1:])
+                parameters = list(signature.parameters.values())
+                # The first one is self or cls.
+                return signature.replace(parameters=parameters[1:])
     # Neither anywhere: the constructor is that of object, which takes nothing.
     return inspect.Signature()
 
@@ -145,16 +149,19 @@ def call_with(
     """
     signature = signature_of(target)
     parameters = signature.parameters
-    # a constructor names what it wants to be told
+
+    # A constructor names what it wants to be told.
     accepted = {name: value for name, value in offered.items() if name in parameters}
     arguments = {**accepted, **required}
+
     # Checked before the call, so that a TypeError from within the target is not taken for ours.
     try:
         signature.bind(**arguments)
     except TypeError as error:
         name = f"{target.__module__}.{getattr(target, '__qualname__', target)}"
+        offer = ", ".join(sorted(arguments)) or "nothing"
+        takes = ", ".join(parameters) or "nothing"
         raise UserError(
-            f"{key}={name}: cannot be called with {', '.join(sorted(arguments)) or 'nothing'} "
-            f"({error}); it takes {', '.join(parameters) or 'nothing'}."
+            f"{key}={name}: cannot be called with {offer} ({error}); it takes {takes}."
         ) from error
     return target(**arguments)

@@ -32,7 +32,9 @@ def devices() -> str:
     import torch
 
     cards = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
-    cuda = f", cuda ({', '.join(cards)}; CUDA {torch.version.cuda})" if cards else ""
+    cuda = ""
+    if cards:
+        cuda = f", cuda ({', '.join(cards)}; CUDA {torch.version.cuda})"
     return f"cpu{cuda}; torch takes {torch.get_num_threads()} threads, a command one"
 
 
@@ -46,6 +48,8 @@ def kernel() -> str:
     loaded = library.find()
     if isinstance(loaded, str):
         raise UserError(f"env.kernel=native {loaded}.")
+
+    # The same five decisions, by both.
     positions = []
     for name in ("native", "torch"):
         env = HighwayEnv(IdmMobilTraffic(), num_envs=16, kernel=name)
@@ -54,12 +58,15 @@ def kernel() -> str:
             state[keys.ACTION] = env.action_spec.zeros()
             state = env.step(state)["next"]
         positions.append(state[keys.VEHICLES, "x"])
+
+    # The two round differently. Not `>=`, since NaN has to fail.
     apart_m = float((positions[0] - positions[1]).abs().max())
     if not apart_m < 0.1:
         raise UserError(
             f"{loaded.maker}: its kernel drives {apart_m:g} m away from the tensor code; set CXX "
             "to another compiler, or env.kernel=torch."
         )
+
     about = f"{loaded.variant}, by {loaded.maker}, drives as the tensor code does"
     return "; ".join((about, *loaded.troubles))
 
@@ -82,23 +89,28 @@ def look(
         return True
     except Exception as error:
         state = "MISSING " if needed else "absent  "
-        print(f"{state} {subject:<32}", *(str(error) or repr(error)).split())
+        # On one line, whatever the error's own are.
+        reason = (str(error) or repr(error)).split()
+        print(f"{state} {subject:<32}", *reason)
         return not needed
 
 
 def examine() -> bool:
     """Print a line about everything; whether all that is needed is there."""
     print(f"ganlane {__version__}, Python {platform.python_version()} ({sys.executable})")
+
     whole = True
     # Those of extras end in a marker, "; extra == 'sb3'". Whether versions fit says pip check.
     for requirement in metadata.requires("ganlane") or []:
         if re.search("(dev|docs|test)['\"]$", requirement):  # which serve a checkout alone
             continue
         name = re.split(r"[^\w-]", requirement)[0]
-        whole &= look(name, partial(metadata.version, name), "extra ==" not in requirement)
+        version = partial(metadata.version, name)
+        whole &= look(name, version, needed="extra ==" not in requirement)
+
     look("native kernel", kernel)
     look("recordings", recordings)
-    return look("devices", devices, True) and whole
+    return look("devices", devices, needed=True) and whole
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

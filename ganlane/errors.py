@@ -71,17 +71,23 @@ def as_typed(value: Any) -> str:
     """A config value as typed on the command line: ``true``, ``null``, ``-120``, ``[64,64]``."""
     if isinstance(value, list | tuple):
         return f"[{','.join(map(as_typed, value))}]"
-    if value is None or isinstance(value, bool):
-        return "null" if value is None else str(value).lower()
-    # the short form is the same number
-    exact = isinstance(value, float) and float(f"{value:g}") == value
-    return f"{value:g}" if exact else str(value)
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    # The short form of a float, 0.1 or 1e+06, where it is the same number.
+    if isinstance(value, float) and float(f"{value:g}") == value:
+        return f"{value:g}"
+    return str(value)
 
 
 def is_users_matter(error: BaseException) -> bool:
     """Whether a user can fix the error: one about a path, a permission or a disk."""
+    # These are OSErrors with a number, too.
     others = (ConnectionError, ChildProcessError, ProcessLookupError, TimeoutError)
-    return isinstance(error, OSError) and bool(error.errno) and not isinstance(error, others)
+    if isinstance(error, others):
+        return False
+    return isinstance(error, OSError) and bool(error.errno)
 
 
 def file_sentence(error: OSError) -> str:
@@ -106,4 +112,5 @@ def numbered_refusals() -> Iterator[None]:
         numbered = getattr(error, "errno", None) is not None
         if code is None or numbered or isinstance(error, UserError):
             raise
-        raise OSError(int(code[1]), os.strerror(int(code[1]))) from error
+        number = int(code[1])
+        raise OSError(number, os.strerror(number)) from error

@@ -50,9 +50,10 @@ def cache_folder() -> Path | None:
     if named is not None:
         return Path(named) if named else None
     try:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ganlane"
-    except RuntimeError:  # as in a container that runs under any number
+        parent = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:  # no home, as in a container that runs under any number
         return None
+    return Path(parent) / "ganlane"
 
 
 def conf_folder() -> Path:
@@ -89,6 +90,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         kind = "a folder" if path.is_dir() else "a device or a pipe"
         raise UserError(f"{path}: {kind}, where a file was to be written; give the name of a file.")
     path.parent.mkdir(parents=True, exist_ok=True)
+
     # In the same folder, since a file can be renamed atomically only within one file system.
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_PART}")
     try:
@@ -96,6 +98,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         part.touch(exist_ok=False)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
+
     try:
         yield part
         with part.open("rb+") as written:
@@ -137,6 +140,7 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
             f"{path}: there already; choose another folder with out=FOLDER, or remove it."
         )
     path.parent.mkdir(parents=True, exist_ok=True)
+
     # Beside the folder, so that the last step is a rename.
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -196,8 +200,11 @@ def write_json(path: str | Path, content: Any) -> None:
 
     With a checksum if an entry is :data:`PLACE`.
     """
-    text = (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
-    write_bytes(path, sealed(text) if PLACE.encode() in text else text)
+    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    encoded = text.encode()
+    if PLACE.encode() in encoded:
+        encoded = sealed(encoded)
+    write_bytes(path, encoded)
 
 
 def read_whole(path: Path) -> bytes:
@@ -242,9 +249,11 @@ def has_checksum(content: bytes | mmap, path: str | Path) -> bool:
     Raises:
         UserError: it has one that does not match; ``path`` is named as the damaged file.
     """
-    begin, end = content.find(_BEGIN), content.find(_END)
+    begin = content.find(_BEGIN)
+    end = content.find(_END)
     if begin < 0 and end < 0:
         return False
+
     # One mark without the other is damage, not a file without a checksum.
     begin += len(_BEGIN)
     if end != begin + len(_ZEROS) or content[begin:end] != _digits(content, begin):
@@ -257,7 +266,9 @@ def has_checksum(content: bytes | mmap, path: str | Path) -> bool:
 
 def _digits(content: bytes | mmap, begin: int) -> bytes:
     """Checksum of ``content`` with zeros in the place of the digits at ``begin``."""
-    view, digest = memoryview(content), hashlib.sha256()
+    # Views, which copy nothing: a file may be larger than the memory.
+    view = memoryview(content)
+    digest = hashlib.sha256()
     for part in (view[:begin], _ZEROS, view[begin + len(_ZEROS) :]):
         digest.update(part)
     return digest.hexdigest().encode()

@@ -52,16 +52,20 @@ def usable_cores() -> int:
 def usable_threads() -> int:
     """``OMP_NUM_THREADS``, else a thread for every usable core."""
     named = os.environ.get("OMP_NUM_THREADS", "")
-    return int(named) if named.isdigit() and int(named) > 0 else usable_cores()
+    # OpenMP allows a list of them, one for each level; that is taken for none.
+    if named.isdigit() and int(named) > 0:
+        return int(named)
+    return usable_cores()
 
 
 def register_envs() -> None:
     """Register the environments with gymnasium, once; do nothing without gymnasium."""
     try:
         import gymnasium
-    # the rest of the package works; 'ganlane doctor' says what is missing
+    # The rest of the package works; 'ganlane doctor' says what is missing.
     except ModuleNotFoundError:
         return
+
     for name, arguments in ENV_IDS.items():
         if name not in gymnasium.registry:
             gymnasium.register(
@@ -133,7 +137,8 @@ def status_of(error: OSError, program: str) -> int:
     Raises:
         OSError: the error, where it is no matter of the user's.
     """
-    # Python writes again at exit, and would fail with a message and a status of its own.
+    # Python writes again at exit, and would fail with a message and a status of its own: what a
+    # stream that refuses still holds goes nowhere.
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (sys.stdout, sys.stderr):
         try:
@@ -141,6 +146,7 @@ def status_of(error: OSError, program: str) -> int:
         except OSError:
             os.dup2(nowhere, stream.fileno())
     os.close(nowhere)
+
     if isinstance(error, BrokenPipeError):
         return READER_LEFT
     if not is_users_matter(error):
@@ -172,9 +178,11 @@ def worker_number() -> int:
     Counted by the process that started it, so a program that runs again has the same numbers.
     """
     process = multiprocessing.current_process()
-    module = getattr(getattr(process, "_target", None), "__module__", None) or ""
+    target = getattr(process, "_target", None)
+    module = getattr(target, "__module__", None) or ""
     if not module.startswith("torchrl."):
         return 0
+
     number = 0
     # A worker of a worker has one part for each of both.
     for part in getattr(process, "_identity", ()):

@@ -26,7 +26,9 @@ def can_compile() -> bool:
 
     A C++ compiler, and a torch from :data:`TRIED_FROM` on.
     """
-    version = tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2])
+    # "2.13.0+cu128"
+    release, _, _ = torch.__version__.partition("+")
+    version = tuple(int(part) for part in release.split(".")[:2])
     return has_compiler() and version >= TRIED_FROM
 
 
@@ -68,6 +70,7 @@ def outside_autocast(function: F) -> F:
         kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
         if not kinds:
             return function(*arguments, **named)
+
         with ExitStack() as stack:
             for kind in kinds:
                 stack.enter_context(torch.autocast(kind, enabled=False))

@@ -41,7 +41,10 @@ def save_weights(
 
     # On the CPU: a file from a GPU must load anywhere.
     flat = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    header = {"ganlane": json.dumps({"kind": kind, **metadata}), "checksum": PLACE}
+    header = {
+        "ganlane": json.dumps({"kind": kind, **metadata}),
+        "checksum": PLACE,
+    }
     write_bytes(path, sealed(save(flat, metadata=header)))
 
 
@@ -50,7 +53,8 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[s
     import torch  # takes seconds
 
     arrays, metadata = load_arrays(path, kind)
-    return {name: torch.from_numpy(array) for name, array in arrays.items()}, metadata
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    return tensors, metadata
 
 
 def load_arrays(path: str | Path, kind: str) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
@@ -80,18 +84,22 @@ def load_arrays(path: str | Path, kind: str) -> tuple[dict[str, npt.NDArray[Any]
             f"{path}: not a readable safetensors file ({error}); "
             f"give a checkpoint of kind {kind} that ganlane wrote."
         ) from error
+
     stored = metadata.get("kind") if isinstance(metadata, dict) else None
     if stored != kind:
         raise UserError(
             f"{path}: expected a ganlane checkpoint of kind {kind}, found "
             f"{stored or 'a file that ganlane did not write'}; give one that ganlane wrote."
         )
+
     # NaN would drive without a word.
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise UserError(
                 f"{path}: {name} holds numbers that are not finite; train or fit it again."
             )
+
+    # Last, so that a file that ganlane did not write is refused as such.
     if not whole:
         refuse_without_checksum(path)
     return arrays, metadata

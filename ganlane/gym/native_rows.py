@@ -27,20 +27,40 @@ from ganlane.settings.episode import Stream
 
 
 class NativeRows(Rows):
-    """N highways by the native kernel."""
+    """N highways by the native kernel.
+
+    All arrays that it gives are the kernel's own, made once and overwritten by every call: nothing
+    is copied here.
+
+    Attributes:
+        batch: what drives.
+    """
 
     def __init__(self, batch: NativeBatch) -> None:
-        self.batch, self.count, self.config = batch, batch.rows, batch.config
+        self.batch = batch
+        self.count = batch.rows
+        self.config = batch.config
         self.episode = self.config.env.episode_parameters()
-        self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
+
+        _, largest = batch.bounds
+        self.space = observation_space(batch.observation.shape[1], largest)
+
         # No recorded scene is driven by the kernel, so none can end.
         self._no_end = np.zeros(self.count, np.bool_)
+
         # Made once, since all arrays in it are the kernel's own.
         self._info = super().info()
+
         # Of the first row, for gymnasium's single environment: functions that read its numbers.
-        numbers = {name: value for name, value in self._info.items() if name not in NO_NUMBERS}
-        self._read = [(name, array.item) for name, array in numbers.items()]
-        self._first_mask = batch.mask[0].view(np.int8) if self.actions.names else None
+        self._read = []
+        for name, array in self._info.items():
+            if name not in NO_NUMBERS:
+                self._read.append((name, array.item))
+
+        # gymnasium's masks are int8. Controls are not numbered, so they have no mask.
+        self._first_mask = None
+        if self.actions.names:
+            self._first_mask = batch.mask[0].view(np.int8)
 
     def info(self) -> dict[str, Any]:
         return self._info
@@ -54,7 +74,10 @@ class NativeRows(Rows):
         return info
 
     def __getstate__(self) -> tuple[NativeBatch, bool]:
-        """Without the views, which a copy has of its own arrays."""
+        """Without the views, which a copy has of its own arrays.
+
+        ``copy.deepcopy`` and ``pickle`` would make arrays of them that nothing writes to.
+        """
         return self.batch, self.started
 
     def __setstate__(self, state: tuple[NativeBatch, bool]) -> None:
@@ -79,8 +102,13 @@ class NativeRows(Rows):
         return self.batch.mask
 
     def array(self, key: Key) -> Array:
+        # Only the end of a recorded scene is missing in the kernel's state.
         array = self.batch.state.get(key, self._no_end)
-        return array[:, keys.EGO_INDEX] if array.ndim > 1 else array
+
+        # Of vehicles [N, M] the ego's.
+        if array.ndim > 1:
+            return array[:, keys.EGO_INDEX]
+        return array
 
     def driven(self) -> tuple[npt.NDArray[np.float64], Integers]:
         return self.batch.time_s, self.batch.lane
@@ -90,12 +118,17 @@ class NativeRows(Rows):
 
 
 def native_rows(config: HighwayConfig) -> NativeRows | None:
-    """The highways of ``config`` by the kernel; None where it cannot drive them."""
+    """The highways of ``config`` by the kernel; None where the tensor code has to drive them.
+
+    Raises:
+        UserError: the weights of the traffic are missing, foreign, or do not fit.
+    """
     env = config.env
     observation = config.observation
     stream = int(Stream.named(config.stream))
-    # The traffic says who drives; the rest is what the kernel's observation and scenes can do.
     drivers = drivers_of(config.traffic, env.idm, env.mobil, stream)
+
+    # The traffic says who drives; the rest is what the kernel's observation and scenes can do.
     if (
         drivers is None
         or (env.kernel == "auto" and not pays(drivers))

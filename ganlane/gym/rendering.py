@@ -1,4 +1,8 @@
-"""Gymnasium's render modes: frames of :mod:`ganlane.view`, drawn while episodes run."""
+"""Gymnasium's render modes: frames of :mod:`ganlane.view`, drawn while episodes run.
+
+:class:`LiveView` is that of the single environment, every physics step with trails;
+:class:`BatchView` that of a batch, the present state of every row.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +28,15 @@ _TRAIL_STEPS = round(FilmConfig.trail_s / PHYSICS_STEP_S) + 1
 
 def _label(rows: TensorRows, row: int) -> EpisodeLabel:
     """The header's text for a row."""
-    name = rows.config.traffic.label()
-    return EpisodeLabel.of(rows.now(), rows.env.base_env.road, "ego", name, row)
+    road = rows.env.base_env.road
+    traffic = rows.config.traffic.label()
+    return EpisodeLabel.of(rows.now(), road, "ego", traffic, row)
 
 
 class LiveView:
     """Records every physics step of one row.
+
+    Nothing but :meth:`close` may be called before the first :meth:`start`.
 
     Args:
         rows: the row; the recorder of its environment is replaced.
@@ -47,19 +54,26 @@ class LiveView:
         #: Frames recorded before the present decision.
         self._before = 0
         self._label = _label(self.rows, 0)
-        self._recorder.add(self.rows.now().get(keys.VEHICLES), 0.0)
+
+        # The scene before anything moves; from here on the environment adds a frame per physics
+        # step.
+        vehicles = self.rows.now().get(keys.VEHICLES)
+        self._recorder.add(vehicles, 0.0)
         self.rows.env.base_env.recorder = self._recorder
+
         self._show()
 
     def before_step(self, action: int) -> None:
-        """Record the action of the next step."""
+        """Record the action of the next step, -1: none that has a number."""
         self._recorder.current_action = action
+
         # An episode may last for hours: what the trails no longer show is dropped.
         del self._recorder.frames[:-_TRAIL_STEPS]
         self._before = len(self._recorder.frames)
 
     def after_step(self, reward: float) -> None:
         """Record the outcome of the step, and show its frames."""
+        # The reward is known only now: of the decision's frames the last one alone shows it.
         self._recorder.current_return += reward
         self._outcome = outcome_of(self.rows.now())
         self._show()
@@ -67,11 +81,13 @@ class LiveView:
     def picture(self) -> Picture:
         """The last frame, [height, width, 3]."""
         # Drawn only when asked for: the painter is made anew from what was recorded so far.
-        return self._painter().draw(len(self._recorder.frames) - 1)
+        last = len(self._recorder.frames) - 1
+        return self._painter().draw(last)
 
     def pictures(self) -> Iterator[Picture]:
         """The frames of the last decision, ten per second; after a reset, the only one."""
-        return map(self._painter().draw, range(self._before, len(self._recorder.frames)))
+        frames = range(self._before, len(self._recorder.frames))
+        return map(self._painter().draw, frames)
 
     def close(self) -> None:
         """Close the window."""
@@ -79,32 +95,45 @@ class LiveView:
             self.window.close()
 
     def _painter(self) -> FramePainter:
-        return FramePainter(self._recorder.trajectory(self._label, self._outcome))
+        """Draws what was recorded so far."""
+        trajectory = self._recorder.trajectory(self._label, self._outcome)
+        return FramePainter(trajectory)
 
     def _show(self) -> None:
         """Show the frames of the last decision in the window, in real time."""
         if self.window is None:
             return
+
         # Drawing takes time of its own, which is taken off the wait.
-        due = time.monotonic() + PHYSICS_STEP_S
+        due_s = time.monotonic() + PHYSICS_STEP_S
         for picture in self.pictures():
             self.window.show(picture)
-            self.window.wait(max(0.0, due - time.monotonic()))
-            due = time.monotonic() + PHYSICS_STEP_S
+
+            left_s = due_s - time.monotonic()
+            self.window.wait(max(0.0, left_s))
+
+            # Not due_s + PHYSICS_STEP_S: a slow frame must not make the next ones hurry.
+            due_s = time.monotonic() + PHYSICS_STEP_S
 
 
 class BatchView:
-    """Draws the present state of every row, without trails."""
+    """Draws the present state of every row, without trails.
+
+    Args:
+        rows: to be drawn; their state is read when pictures are asked for.
+    """
 
     def __init__(self, rows: TensorRows) -> None:
         self.rows = rows
-        # Return and last action are all that is kept: without trails no past state is needed.
+        # Return and last action are all that is kept: without trails no past state is needed. An
+        # action of -1 is shown as none.
         self._returns = np.zeros(rows.count)
         self._actions = np.full(rows.count, -1)
 
     def start(self, fresh: Flags) -> None:
         """New episodes begin in the rows where ``fresh`` [N] is true."""
-        self._returns[fresh], self._actions[fresh] = 0.0, -1
+        self._returns[fresh] = 0.0
+        self._actions[fresh] = -1
 
     def after_step(self, actions: npt.ArrayLike, reward: npt.NDArray[np.float64]) -> None:
         """Record actions and rewards [N] of a step."""
@@ -116,11 +145,18 @@ class BatchView:
         return tuple(map(self._picture, range(self.rows.count)))
 
     def _picture(self, row: int) -> Picture:
-        # A film of one frame.
+        """The last frame of a row, [height, width, 3]."""
         state = self.rows.now()
         recorder = Recorder(
-            row, current_action=int(self._actions[row]), current_return=float(self._returns[row])
+            row,
+            current_action=int(self._actions[row]),
+            current_return=float(self._returns[row]),
         )
-        seconds = float(state.get(keys.STEP)[row]) * PHYSICS_STEP_S
-        recorder.add(state.get(keys.VEHICLES), seconds)
-        return FramePainter(recorder.trajectory(_label(self.rows, row))).draw(0)
+
+        # A film of one frame.
+        time_s = float(state.get(keys.STEP)[row]) * PHYSICS_STEP_S
+        recorder.add(state.get(keys.VEHICLES), time_s)
+
+        label = _label(self.rows, row)
+        trajectory = recorder.trajectory(label)
+        return FramePainter(trajectory).draw(0)

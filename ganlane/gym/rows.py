@@ -124,9 +124,11 @@ class Rows(ABC):
         """Gymnasium's info (docs/gymnasium.md) as arrays [N] by name; valid until the next call."""
         info: dict[str, Any] = {name: self.array(key) for name, key in INFO.items()}
         info["time_s"], info["lane"] = self.driven()
+
         # gymnasium's Discrete.sample() takes masks of int8; the bytes of booleans are the same.
         if self.actions.names:
             info[ACTION_MASK] = self.mask().view(np.int8)
+
         info[keys.REWARD_TERMS] = self.reward_terms()
         return info
 
@@ -144,7 +146,8 @@ def observation_space(size: int, largest: float) -> Box:
     low = np.full(size, -1.0, np.float32)
     high = np.full(size, largest, np.float32)
     # The first number is the ego's speed as a ratio, which is never negative.
-    low[0], high[0] = 0.0, SPEED_RATIO_LIMIT
+    low[0] = 0.0
+    high[0] = SPEED_RATIO_LIMIT
     return Box(low, high, dtype=np.float32)
 
 
@@ -153,9 +156,11 @@ def row_of(info: Mapping[str, Any], row: int) -> dict[str, Any]:
     # Of the numbers by a plain loop over methods: with a test of every value it took half as long
     # again.
     values = {name: value.item(row) for name, value in info.items() if name not in NO_NUMBERS}
+
     # A copy, since arrays are views of what the next step overwrites.
     if ACTION_MASK in info:
         values[ACTION_MASK] = info[ACTION_MASK][row].copy()
+
     terms = info[keys.REWARD_TERMS]
     values[keys.REWARD_TERMS] = {name: value.item(row) for name, value in terms.items()}
     return values
@@ -164,7 +169,8 @@ def row_of(info: Mapping[str, Any], row: int) -> dict[str, Any]:
 def array_of(value: Any) -> npt.NDArray[Any]:
     """A user's value as an array.
 
-    An array of None if it cannot be one, such as lists of different lengths.
+    An array of None if it cannot be one, such as lists of different lengths. Nothing is raised: the
+    caller knows what was expected.
     """
     try:
         return np.asarray(value)
@@ -186,7 +192,9 @@ def action_of(action: Any, actions: ActionParameters, number: Integers) -> Integ
         number[0] = action
         return number
     array = array_of(action)
-    return actions_of(array.reshape(-1) if actions.names else array[None], 1, actions)
+    # A batch of one row: of numbers [1], of controls [1, 2].
+    batch = array.reshape(-1) if actions.names else array[None]
+    return actions_of(batch, 1, actions)
 
 
 def actions_of(commanded: Any, rows: int, actions: ActionParameters) -> Integers | Floats:
@@ -196,6 +204,8 @@ def actions_of(commanded: Any, rows: int, actions: ActionParameters) -> Integers
         UserError: another shape, no such action, or a number that is not finite.
     """
     array = array_of(commanded)
+
+    # Continuous controls have no names.
     if not actions.names:
         fits = array.shape == (rows, CONTROLS) and array.dtype.kind in "iuf"
         if not fits or not np.isfinite(array).all():
@@ -204,8 +214,9 @@ def actions_of(commanded: Any, rows: int, actions: ActionParameters) -> Integers
                 "acceleration and lateral target; give both for every environment."
             )
         return array.astype(np.float32, copy=False)
+
+    # The type is looked at before any cast, which would round and wrap.
     numbers = None
-    # Before any cast, which would round and wrap.
     if array.shape == (rows,) and array.dtype.kind in "iu":
         numbers = array.astype(np.int64, copy=False)
     # As unsigned numbers those below 0 are above all others: one search in place of two.
@@ -218,11 +229,16 @@ def actions_of(commanded: Any, rows: int, actions: ActionParameters) -> Integers
 
 
 def reset_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dict[str, Any]:
-    """The options of a reset, checked for unknown names."""
+    """The options of a reset as a new dictionary.
+
+    Raises:
+        UserError: they are no dictionary, or have a key that is not in ``names``.
+    """
     if not isinstance(options, dict | None):
         raise UserError(
             f"options={options!r}: expected a dictionary with {', '.join(names)}, or none."
         )
+    # As text, since a user's keys may be of types that cannot be sorted together.
     unknown = sorted(map(str, set(options or {}) - set(names)))
     if unknown:
         raise UserError(f"options: {', '.join(unknown)} unknown; a reset takes {', '.join(names)}.")

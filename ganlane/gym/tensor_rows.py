@@ -1,4 +1,7 @@
-"""Every traffic for gymnasium, by the TorchRL environment behind NumPy arrays."""
+"""Every traffic for gymnasium, by the TorchRL environment behind NumPy arrays.
+
+Imports torch, which takes seconds: import it only where the native kernel will not do.
+"""
 
 # ruff: noqa: D102 - Rows has the docstrings of the methods
 from __future__ import annotations
@@ -17,7 +20,6 @@ from ganlane import keys
 from ganlane.agents.drivers import legal_actions
 from ganlane.build import make_highways
 from ganlane.gym.rows import Flags, Floats, Integers, Rows, observation_space
-from ganlane.keys import EGO_INDEX
 from ganlane.native.batch import Stepped
 from ganlane.native.settings import Array, Key
 from ganlane.settings.commands import HighwayConfig
@@ -28,10 +30,19 @@ from ganlane.sim.state import Road, road_in
 class TensorRows(Rows):
     """N highways by the TorchRL environment.
 
+    Args:
+        config: the settings of the highways.
+        transforms: a user's own, behind those that the settings ask for.
+
     Attributes:
         env: the TorchRL environment of the settings, with a user's own transforms at the end.
         state: of its rows, from the first :meth:`start` on.
+
+    Raises:
+        UserError: a wrong value, or missing weights.
     """
+
+    state: TensorDictBase
 
     def __init__(self, config: HighwayConfig, transforms: Sequence[Transform] = ()) -> None:
         self.config = config
@@ -46,25 +57,31 @@ class TensorRows(Rows):
         self.episode = base.episode
 
         size = self.env.observation_spec[keys.OBSERVATION].shape[-1]
-        # One form counts metres of overlap, so its bound follows from the longest vehicle.
+        # Some forms count metres of overlap, so their bound follows from the longest vehicle.
         largest = largest_number(config.observation.form, base.scenes.longest_m)
         self.space = observation_space(size, largest)
-
-    state: TensorDictBase
 
     @torch.no_grad()
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
         counters = TensorDict({}, [self.count], device=self.env.device)
-        for name, value in {keys.SEED: seed, keys.EPISODE: episode}.items():
+        named = {
+            keys.SEED: seed,
+            keys.EPISODE: episode,
+        }
+
+        for name, value in named.items():
             # One number for all rows, or one for each: [N].
             numbers = np.broadcast_to(value, self.count).astype(np.int64)
             counters[name] = torch.as_tensor(numbers, device=self.env.device)
+
+        # Without a mask the counters name the episodes that begin.
         self.state = self.env.reset(counters)
         self.started = True
 
     @torch.no_grad()
     def restart(self, rows: Flags) -> None:
-        # TorchRL resets where its flag [N, 1] is set, and leaves the other rows alone.
+        # TorchRL resets where its flag [N, 1] is set, and leaves the other rows alone. The counters
+        # of the state are then those of the episodes that have ended: the next ones follow.
         mask = torch.as_tensor(rows, device=self.env.device)[:, None]
         flagged = self.now().set("_reset", mask)
         self.state = self.env.reset(flagged)
@@ -78,9 +95,18 @@ class TensorRows(Rows):
         self.state = self.env.step_mdp(stepped)
 
         # TorchRL's rewards and ends are [N, 1], gymnasium's [N].
-        names = (keys.REWARD, "terminated", "truncated")
-        reward, *ends = (_array(stepped["next", name][:, 0]) for name in names)
-        return Stepped(self.observation(), reward.astype(np.float32), *ends)
+        after = stepped["next"]
+        reward = _array(after[keys.REWARD][:, 0])
+        terminated = _array(after["terminated"][:, 0])
+        truncated = _array(after["truncated"][:, 0])
+
+        return Stepped(
+            self.observation(),
+            # A highway in float64 has rewards in float64.
+            reward.astype(np.float32),
+            terminated,
+            truncated,
+        )
 
     def now(self) -> TensorDictBase:
         """The state of all rows; raises :class:`UserError` before the first :meth:`start`."""
@@ -89,34 +115,45 @@ class TensorRows(Rows):
 
     def observation(self) -> Floats:
         observation = _array(self.now().get(keys.OBSERVATION))
+
         # A speed far above the desired one would leave the space.
         return np.clip(observation, self.space.low, self.space.high)
 
     def mask(self) -> Flags:
         state = self.now()
+
         # An environment with a mask has computed it; without one it is the actions on the road.
         mask = state.get(keys.ACTION_MASK, None)
         if mask is None:
             mask = legal_actions(state, self._road(), self.actions)
+
         return _array(mask)
 
     def array(self, key: Key) -> Array:
         array = _array(self.now().get(key))
-        # The ego is the first vehicle; events have the shape [N, 1].
-        return array[:, EGO_INDEX] if array.ndim > 1 else array
+
+        # Of vehicles [N, M] the ego's, which is the first. Events are [N, 1], where the index of
+        # the ego takes off the dimension of one.
+        if array.ndim > 1:
+            return array[:, keys.EGO_INDEX]
+        return array
 
     def driven(self) -> tuple[npt.NDArray[np.float64], Integers]:
         # Counted in physics steps, so that it has no sum of rounding errors.
         time_s = self.array(keys.STEP) * keys.PHYSICS_STEP_S
+
+        # Numbers that all rows share become [1], those of recorded scenes, [N, 1], become [N].
         road = self._road()
-        # One number for all rows, or [N, 1].
-        lanes, width_m = (
-            _array(torch.as_tensor(number).flatten()) for number in (road.lanes, road.lane_width_m)
-        )
-        y = self.array((keys.VEHICLES, "y"))
-        # The road's own rounding, in the run's float type.
-        lane = np.rint(y / width_m.astype(y.dtype))
-        lane = np.minimum(np.maximum(lane, 0.0), lanes - 1)
+        lanes = _array(torch.as_tensor(road.lanes).flatten())
+        width_m = _array(torch.as_tensor(road.lane_width_m).flatten())
+
+        # Lane 0 has its centre at y = 0. Computed in the float type of the run, as the road does,
+        # so that both round alike.
+        y_m = self.array((keys.VEHICLES, "y"))
+        nearest = np.rint(y_m / width_m.astype(y_m.dtype))
+
+        # An ego that has left the road is in the outer lane.
+        lane = np.minimum(np.maximum(nearest, 0.0), lanes - 1)
         return time_s, lane.astype(np.int64)
 
     def _road(self) -> Road:
@@ -124,6 +161,7 @@ class TensorRows(Rows):
         return road_in(self.now(), self.env.base_env.road)
 
     def reward_terms(self) -> dict[str, Array]:
+        # TorchRL has them as [N, 1].
         terms = self.now().get(keys.REWARD_TERMS).items()
         return {name: _array(term[:, 0]) for name, term in terms}
 

@@ -67,12 +67,17 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
                 f"render_mode={render_mode}: a batch has rgb_array only; "
                 "use gymnasium.make for a window."
             )
-        # What happens to a row whose episode is over: reset in this step, in the next, or by the
-        # caller.
         self._mode = _mode_of(autoreset_mode)
-        self._rows = make_rows(traffic, num_envs, render_mode is not None, transforms, options)
+        self._rows = make_rows(
+            traffic,
+            num_envs,
+            pictures=render_mode is not None,
+            transforms=transforms,
+            keys=options,
+        )
         self.num_envs = self._rows.count
         self.render_mode = render_mode
+
         episode = self._rows.episode
         if max_episode_steps is not None:
             limit = whole_number("max_episode_steps", max_episode_steps, 1, 2**31)
@@ -82,16 +87,24 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
                     f"max_episode_steps={limit}: a batch has its own time limit; "
                     f"give timeout_s={limit * episode.decision_period_s:g}."
                 )
+
         # A picture per decision.
         fps = max(1, round(1.0 / episode.decision_period_s))
-        self.metadata = {**self.metadata, "autoreset_mode": self._mode, "render_fps": fps}
+        self.metadata = {
+            **self.metadata,
+            "autoreset_mode": self._mode,
+            "render_fps": fps,
+        }
+
         self.single_observation_space = self._rows.space
         self.single_action_space = self._rows.action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
+
         self._seed = None if seed is None else seed_number(seed)
         #: Rows whose episode is over, until they are reset.
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)
+
         self._view: Any = None
         if render_mode is not None:
             from ganlane.gym.rendering import BatchView  # with torch, which takes seconds
@@ -101,7 +114,19 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin episodes in all rows, or with ``reset_mask`` in some; see the class for which."""
+        """Begin episodes in all rows, or with ``reset_mask`` in some; see the class for which.
+
+        Args:
+            seed: one for all rows, or N of them; None: that of the constructor at first, and then
+                each row goes on with its next episode.
+            options: ``episode``, one number from 0 or N of them, or ``reset_mask``, bool [N].
+
+        Returns:
+            Observations [N, D] and info, both the caller's to keep.
+
+        Raises:
+            UserError: a wrong value, or a mask before the first reset.
+        """
         chosen = reset_options(options, ("episode", "reset_mask"))
         if "reset_mask" in chosen:
             fresh = array_of(chosen["reset_mask"])
@@ -116,6 +141,8 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
             fresh = np.ones(self.num_envs, dtype=np.bool_)
             self._start(seed, chosen.get("episode"))
         self._begun(fresh)
+
+        # Copies: the arrays of the rows are overwritten by the next step.
         return self._rows.observation().copy(), _copied(self._rows.info())
 
     def _begun(self, fresh: Flags) -> None:
@@ -127,11 +154,14 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
     def _start(self, seed: int | Sequence[int] | None, episode: Any) -> None:
         """Begin the episodes that the arguments of a reset name, or the next ones, in all rows."""
         # Row i begins with episode i and adds N each time, so no two rows drive the same one.
-        rows = first = np.arange(self.num_envs)
-        seeds: Any = self._seed
+        rows = np.arange(self.num_envs)
+        first = rows
+
         # A seed starts with its first episodes; without one every row goes on with its next.
+        seeds: Any = self._seed
         if seed is not None:
             seeds = [seed_number(one) for one in array_of(seed).ravel().tolist()]
+            # gymnasium seeds np_random here, from which unseeded environments draw. It takes one.
             super().reset(seed=seeds[0] if len(seeds) == 1 else None)
         elif self._rows.started:
             # A copy: the state's own array is overwritten by the start.
@@ -139,10 +169,13 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
             first = self._rows.array(keys.EPISODE) + self.num_envs
         elif seeds is None:
             seeds = int(self.np_random.integers(SEEDS))
+
         if episode is not None:
             first = array_of(episode)
-            # Cast first: an unsigned number too large for int64 is below 0 then.
-            first = first.astype(np.int64) if first.dtype.kind in "iu" else np.asarray(-1)
+            whole = first.dtype.kind in "iu"
+            # Cast first: an unsigned number too large for int64 is below 0 then. What is not whole
+            # is refused as a number below 0 is.
+            first = first.astype(np.int64) if whole else np.asarray(-1)
             if (first < 0).any():
                 raise UserError(
                     f"options: episode={episode!r:.80}: expected whole numbers from 0; "
@@ -151,6 +184,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
             # One number k for all means the episodes k, k + 1, ...
             if first.ndim == 0:
                 first = first + rows
+
         # One seed for all rows, or one for each.
         if first.shape != (self.num_envs,) or np.size(seeds) not in (1, self.num_envs):
             raise UserError(
@@ -161,36 +195,55 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
         self._rows.start(seeds, first)
 
     def step(self, actions: Any) -> tuple[Floats, npt.NDArray[Any], Flags, Flags, dict[str, Any]]:
-        """One decision in every row: observations [N, D], rewards and ends [N], info."""
+        """One decision in every row: observations [N, D], rewards and ends [N], info.
+
+        Args:
+            actions: numbers of actions [N], or controls [N, 2] from -1 to 1.
+
+        Returns:
+            ``(observations, rewards, terminated, truncated, info)``, rewards in float64 and ends as
+            bool, all the caller's to keep. The class says what a row gives whose episode ends.
+
+        Raises:
+            UserError: wrong actions, no reset before, or with ``DISABLED`` a row that is over.
+        """
         self._rows.check_started()
+
+        # Rows that ended one step ago, with NEXT_STEP and DISABLED. With SAME_STEP no row waits.
         same_step = self._mode is AutoresetMode.SAME_STEP
         waiting = self._ended
-        # With SAME_STEP no row waits.
         waits = not same_step and waiting.any()
         if waits and self._mode is AutoresetMode.DISABLED:
             raise UserError(
                 f"step(): the episodes of rows {np.flatnonzero(waiting).tolist()} are over; call "
                 "reset(options={'reset_mask': mask}) first, or choose another autoreset_mode."
             )
+
         # The arrays of the rows are overwritten by their next call; what callers get are copies.
         commanded = actions_of(actions, self.num_envs, self._rows.actions)
         stepped = self._rows.step(commanded)
         reward = stepped.reward.astype(np.float64)
         terminated = stepped.terminated.copy()
         truncated = stepped.truncated.copy()
+
         if self._view is not None:
             # Pictures name the numbered actions.
-            self._view.after_step(commanded if self._rows.actions.names else -1, reward)
+            numbers = commanded if self._rows.actions.names else -1
+            self._view.after_step(numbers, reward)
+
         # NEXT_STEP: these rows ended one step ago. They were stepped with the others, which is
         # discarded here.
         if waits:
-            for numbers in (reward, terminated, truncated):
-                numbers[waiting] = 0
+            for result in (reward, terminated, truncated):
+                result[waiting] = 0
             self._rows.restart(waiting)
             self._begun(waiting)
-        ended = self._ended = terminated | truncated
-        final: dict[str, Any] = {}
+
+        ended = terminated | truncated
+        self._ended = ended
+
         # SAME_STEP: the last observation and info go into the info, before the rows are reset.
+        final: dict[str, Any] = {}
         if same_step and ended.any():
             final = {
                 "final_obs": _where(ended, self._rows.observation()),
@@ -200,6 +253,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
             }
             self._rows.restart(ended)
             self._begun(ended)
+
         observation = self._rows.observation().copy()
         info = _copied(self._rows.info())
         return observation, reward, terminated, truncated, info | final
@@ -219,11 +273,13 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
 
 
 def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
-    """gymnasium's mode, given as such or by name."""
+    """gymnasium's mode, given as such, by its name or by its value."""
     choices = {choice.name.lower(): choice for choice in AutoresetMode}
+    text = str(mode).lower()
     for name, choice in choices.items():
-        if mode is choice or str(mode).lower() in (name, choice.value.lower()):
+        if mode is choice or text in (name, choice.value.lower()):
             return choice
+
     raise UserError(
         f"autoreset_mode={mode}: expected one of {', '.join(choices)}; choose one of them."
     )
@@ -240,7 +296,8 @@ def _where(rows: Flags, observations: Floats) -> npt.NDArray[np.object_]:
 
 def _copied(info: dict[str, Any]) -> dict[str, Any]:
     """A copy of an info, which the caller may keep."""
-    # Without a test of every value, which took a quarter of this function's time.
+    # The terms of the reward are a dictionary, whose copy() has the same arrays: they are copied
+    # once more below. To test every value for it took a quarter of this function's time.
     terms = info[keys.REWARD_TERMS]
     copy = {name: value.copy() for name, value in info.items()}
     copy[keys.REWARD_TERMS] = {name: term.copy() for name, term in terms.items()}

@@ -113,6 +113,7 @@ _COUNT: Final[_Array] = ("int64", ())
 
 
 def _numbers(count: int) -> _Array:
+    """``count`` numbers of every vehicle."""
     return ("float32", (count,))
 
 
@@ -160,9 +161,10 @@ class RuleDrivers:
         arrays = {"steering": _NUMBER}
         if self.random is not None:
             arrays["traits"] = _numbers(_TRAITS)
-            delay = _steps(self.random.reaction_s[1])
-            if delay:
-                arrays["past"] = _numbers(delay)
+            # The accelerations decided last, as many as the longest reaction takes steps.
+            longest_steps = _steps(self.random.reaction_s[1])
+            if longest_steps:
+                arrays["past"] = _numbers(longest_steps)
         return _memory(arrays)
 
     def structures(self) -> dict[str, Structure]:
@@ -171,8 +173,10 @@ class RuleDrivers:
             return {"faults": _faults_of(self.faults)}
         if self.random is None:
             return {}
+
         ranges = {name: range_of(bounds) for name, bounds in vars(self.random).items()}
-        return {"random": _Random(**ranges, delay_steps=_steps(self.random.reaction_s[1]))}
+        longest_steps = _steps(self.random.reaction_s[1])
+        return {"random": _Random(**ranges, delay_steps=longest_steps)}
 
 
 @dataclass(frozen=True)
@@ -246,8 +250,10 @@ class GeneratedDrivers(NetworkDrivers):
                 "lane_change.wish": _COUNT,
                 "lane_change.waited": _COUNT,
             }
+
         arrays["generator.displacement"] = _numbers(2)
         arrays["generator.noise"] = _numbers(sizes.noise)
+        # The last motions, oldest first, each as its part of the LSTM's four gates.
         for index in range(sizes.observed - 1):
             arrays[f"generator.motion_{index}"] = _numbers(4 * sizes.hidden)
         return _memory(arrays)
@@ -273,17 +279,24 @@ class HumanDrivers(NetworkDrivers):
 
     def memory(self) -> MemoryArrays:
         """Their memory in the order of human.hpp."""
-        counts = dict(HUMAN_MEMORY) | dict.fromkeys(
-            ("acceleration", "lateral_from", "lateral_to"), 1
-        )
-        return _memory(
-            {name: _NUMBER if count == 1 else _numbers(count) for name, count in counts.items()}
-        )
+        counts = {
+            **dict(HUMAN_MEMORY),
+            "acceleration": 1,
+            "lateral_from": 1,
+            "lateral_to": 1,
+        }
+        arrays = {}
+        for name, count in counts.items():
+            arrays[name] = _NUMBER if count == 1 else _numbers(count)
+        return _memory(arrays)
 
     def structures(self) -> dict[str, Structure]:
         """As of :class:`RuleDrivers`."""
-        packed = _packed(_human_layers(self.sizes), self.weights)
-        numbers = vars(self.sizes) | vars(self.variation) | {"weights": packed}
+        numbers = {
+            **vars(self.sizes),
+            **vars(self.variation),
+            "weights": _packed(_human_layers(self.sizes), self.weights),
+        }
         return {"human": filled(Human, numbers)}
 
 
@@ -333,6 +346,7 @@ def parts_of(drivers: Drivers) -> list[Part]:
     """The parts of mixed drivers; others are one part."""
     if not isinstance(drivers, MixedDrivers):
         return [Part(drivers, drivers.memory())]
+
     parts = []
     for name, part in drivers.parts.items():
         # The memory of a part is below its name.
@@ -359,19 +373,27 @@ def by_network(drivers: Drivers) -> bool:
 
 
 def mixed_drivers(parts: Mapping[str, Drivers | None], shares: Mapping[str, int]) -> Drivers | None:
-    """Drivers in turns, by their ``shares``; None where the kernel cannot drive one of them."""
+    """Drivers in turns, by their ``shares``; None where the kernel cannot drive one of them.
+
+    Args:
+        parts: drivers by name; None: the kernel cannot drive as they do.
+        shares: of the episodes, as whole numbers by the same names.
+    """
     drivers: dict[str, OneKind] = {}
     for name, part in parts.items():
         if part is None or isinstance(part, MixedDrivers):
             return None
         drivers[name] = part
+
     names = list(drivers)
-    mixed = MixedDrivers(drivers, tuple(names.index(name) for name in interleaved(shares)))
-    # One ego for all rows.
-    same = all(
-        (part.idm, part.steering) == (mixed.idm, mixed.steering) for part in drivers.values()
-    )
-    return mixed if same else None
+    turns = tuple(names.index(name) for name in interleaved(shares))
+    mixed = MixedDrivers(drivers, turns)
+
+    # The kernel has one ego for all rows.
+    for part in drivers.values():
+        if (part.idm, part.steering) != (mixed.idm, mixed.steering):
+            return None
+    return mixed
 
 
 def blind(drivers: Drivers, share: float) -> Drivers | None:
@@ -380,11 +402,17 @@ def blind(drivers: Drivers, share: float) -> Drivers | None:
     """
     if isinstance(drivers, MixedDrivers):
         parts = {name: blind(part, share) for name, part in drivers.parts.items()}
-        return None if None in parts.values() else replace(drivers, parts=parts)  # type: ignore[arg-type]
-    return None if drivers.blind_share else replace(drivers, blind_share=share)
+        if None in parts.values():
+            return None
+        return replace(drivers, parts=parts)  # type: ignore[arg-type]
+
+    if drivers.blind_share:
+        return None
+    return replace(drivers, blind_share=share)
 
 
 def _steps(seconds: float) -> int:
+    """Physics steps in so many seconds."""
     return round(seconds / keys.PHYSICS_STEP_S)
 
 
@@ -397,17 +425,33 @@ def decision_settings(
 ) -> Settings:
     """The numbers of a decision: of road, driving and episode.
 
-    ``ego_mobil``: how the ego falls behind before a change that it has to make; None: as the
-    others.
+    Args:
+        highway: the road, and what the ego is commanded.
+        drivers: the others, and how the ego follows and steers.
+        episode, ego: None: their defaults.
+        ego_mobil: how the ego falls behind before a change that it has to make; None: as the
+            others.
+
+    Raises:
+        UserError: more lanes than the kernel has room for on a road with lanes that end.
     """
     episode = episode or EpisodeParameters()
-    idm, steering = drivers.idm, drivers.steering
+    ego = ego or EgoParameters()
+    idm = drivers.idm
+    steering = drivers.steering
     mobil = drivers.mobil or MobilParameters()
-    # No two of these records have a field of one name.
-    records = (episode, ego or EgoParameters(), idm, steering, mobil)
-    numbers = {name: value for record in records for name, value in vars(record).items()}
     ego_mobil = ego_mobil or mobil
-    numbers |= highway._asdict() | {
+
+    # No two of these records have a field of one name.
+    numbers: dict[str, Any] = {
+        **vars(episode),
+        **vars(ego),
+        **vars(idm),
+        **vars(steering),
+        **vars(mobil),
+        **highway._asdict(),
+    }
+    numbers |= {
         # The kernel multiplies where the model divides by a constant.
         "per_brake_scale": 1.0 / idm.brake_scale(),
         "per_near_s": 1.0 / steering.near_s,
@@ -422,12 +466,17 @@ def decision_settings(
         "foresight": False,
         "stream": drivers.stream,
         "blind_share": drivers.blind_share,
+        # How the ego falls behind.
         "courtesy": ego_mobil.courtesy,
         "safe_behind": ego_mobil.safe_deceleration,
+        # Further structures, None (a null pointer) where the highway has nothing of the kind.
         "ends": ends_of(highway.stretches, ego_mobil),
         "actions": actions_of(highway.actions, episode.decision_period_s),
         "flow": flow_of(highway, episode.decision_period_s),
-        **dict.fromkeys(("generated", "human", "faults", "random")),
+        "generated": None,
+        "human": None,
+        "faults": None,
+        "random": None,
         **drivers.structures(),
     }
     return filled(Settings, numbers)
@@ -438,8 +487,10 @@ def mask_settings(
 ) -> Settings:
     """The numbers of the masks ``safe`` and ``foresight``."""
     # The mask reads few of the decision's numbers; the others are defaults.
-    drivers = RuleDrivers(idm, mobil=MobilParameters(safe_deceleration=mask.safe_deceleration))
-    settings = decision_settings(highway, drivers, ego=EgoParameters(abort_lane_change=abort))
+    mobil = MobilParameters(safe_deceleration=mask.safe_deceleration)
+    drivers = RuleDrivers(idm, mobil=mobil)
+    ego = EgoParameters(abort_lane_change=abort)
+    settings = decision_settings(highway, drivers, ego=ego)
     settings.foresight = mask.form == "foresight"
     return settings
 
@@ -458,7 +509,9 @@ class _Faults(Structure):
 
 
 def _faults_of(faults: DriverFaults) -> _Faults:
-    braking, late = faults.phantom_braking, faults.late_reaction
+    """The numbers of the mistakes; durations become physics steps, rates chances in one."""
+    braking = faults.phantom_braking
+    late = faults.late_reaction
     return _Faults(
         braking_chance=chance_in_step(braking.per_hour),
         braking_steps=_steps(braking.lasts_s),
@@ -475,7 +528,9 @@ def _faults_of(faults: DriverFaults) -> _Faults:
 
 def chance_in_step(per_hour: float) -> float:
     """Of at least one event of a Poisson process within a step."""
-    return -math.expm1(-per_hour * keys.PHYSICS_STEP_S / 3600.0)
+    events_in_step = per_hour * keys.PHYSICS_STEP_S / 3600.0
+    # 1 - exp(-events), without the rounding near 1.
+    return -math.expm1(-events_in_step)
 
 
 class _Random(Structure):
@@ -537,26 +592,37 @@ class Generated(Structure):
 
 
 def _generated_of(drivers: GeneratedDrivers) -> Generated:
+    """The numbers of generated drivers; durations become physics steps, rates chances in one."""
     dt = keys.PHYSICS_STEP_S
+    sizes = drivers.sizes
+    sudden = drivers.sudden
+    # Defaults where the kernel does not read them: it is told below whether there are any.
     guard = drivers.guard or GuardParameters()
     anchor = drivers.anchor or ANCHOR
-    sudden, sizes = drivers.sudden, drivers.sizes
-    period = drivers.noise_period_s
+
     # As closed_loop.wander: what stays of a latent vector in a step.
-    share = math.exp(-dt / period) if period > 0 else 0.0
-    packed = _packed(_layers(sizes), drivers.weights)
-    widths = vars(sizes) | {"weights": packed, "motions": sizes.observed - 1}
+    period_s = drivers.noise_period_s
+    share = math.exp(-dt / period_s) if period_s > 0 else 0.0
+
+    network = {
+        **vars(sizes),
+        "weights": _packed(_layers(sizes), drivers.weights),
+        # A motion has its difference to the one before, so the first one observed is none.
+        "motions": sizes.observed - 1,
+    }
     numbers: dict[str, Any] = {
         **vars(drivers),
         **vars(drivers.changes),
         **vars(anchor),
         **vars(anchor.idm),
         **vars(guard),
-        "network": filled(Network, widths),
-        "noise_share": share,
-        "noise_fresh": math.sqrt(1.0 - share * share),
+        "network": filled(Network, network),
         "calibrated": drivers.anchor is not None,
         "guard": drivers.guard is not None,
+        # Latent vectors: what stays in a step, and what is added so that their variance stays.
+        "noise_share": share,
+        "noise_fresh": math.sqrt(1.0 - share * share),
+        # Of the paper's drivers.
         "sudden_chance": dt / sudden.every_s,
         "sudden_mean": sudden.mean,
         "sudden_sd": sudden.sd,
@@ -564,6 +630,7 @@ def _generated_of(drivers: GeneratedDrivers) -> Generated:
         "guard_headway_s": guard.headway_s,
         # The guard's pull within a step.
         "centring": guard.centring_per_s * dt,
+        # Of the calibrated drivers.
         "per_brake_scale": 1.0 / anchor.idm.brake_scale(),
         "residual_along": anchor.residual[0],
         "residual_across": anchor.residual[1],
@@ -577,6 +644,7 @@ def _generated_of(drivers: GeneratedDrivers) -> Generated:
 class _Layer(NamedTuple):
     """A layer of a network by its names in the ``state_dict``.
 
+    ``bias``: None: it has none, or another layer adds it. ``outputs`` has those of all gates.
     ``gates``: those of an LSTM that the kernel computes; a layer without gates is one gate.
     """
 
@@ -588,22 +656,29 @@ class _Layer(NamedTuple):
 
 
 def _dense(name: str, inputs: int, outputs: int, gates: tuple[int, ...] = (0,)) -> _Layer:
+    """A layer with a bias."""
     return _Layer(f"{name}.weight", f"{name}.bias", inputs, outputs, gates)
 
 
 def _layers(s: GeneratorSizes) -> list[_Layer]:
     """All layers of a generator in the order of ``layers_of`` in network.hpp."""
-    motion, gates, state = 4, 4 * s.hidden, s.hidden + s.pooled + s.extra_inputs
-    # The decoder's cell begins at 0, so its forget gate is left out.
-    every, three = (0, 1, 2, 3), (0, 2, 3)
-    pair = "pooling.per_pair.bias"
+    motion = 4
+    state = s.hidden + s.pooled + s.extra_inputs
+
+    # Input, forget, output, new. The decoder's cell begins at 0, so its forget gate is left out.
+    gates = 4 * s.hidden
+    every = (0, 1, 2, 3)
+    three = (0, 2, 3)
+
+    # The bias of a pair's first layer is added with the other vehicle's term.
+    pair_bias = "pooling.per_pair.bias"
+
     return [
         _dense("encoder.embed", motion, s.embedding),
         _dense("encoder.input", s.embedding, gates, every),
         _Layer("encoder.recurrent", None, s.hidden, gates, every),
-        # The bias of a pair's first layer is added with the other vehicle's term.
         _Layer("pooling.per_pair.weight", None, motion, s.pooling),
-        _Layer("pooling.per_vehicle.weight", pair, s.hidden, s.pooling),
+        _Layer("pooling.per_vehicle.weight", pair_bias, s.hidden, s.pooling),
         _dense("pooling.second", s.pooling, s.pooled),
         _dense("context.0", state, s.context),
         _dense("context.2", s.context, s.hidden - s.noise),
@@ -633,7 +708,9 @@ def _check_shapes(source: Path, sizes: Any, layers: list[_Layer], weights: Weigh
         shapes[layer.weight] = (layer.outputs, layer.inputs)
         if layer.bias is not None:
             shapes[layer.bias] = (layer.outputs,)
-    if {name: array.shape for name, array in weights.items()} != shapes:
+
+    stored = {name: array.shape for name, array in weights.items()}
+    if stored != shapes:
         raise misfit(source, vars(sizes))
 
 
@@ -642,8 +719,10 @@ def _packed(layers: list[_Layer], weights: Weights) -> Floats:
     to a vector.
     """
     numbers = np.concatenate([_filled_up(layer, weights) for layer in layers])
+
+    # NumPy aligns to 16 bytes, a vector has up to 64: 16 numbers of 4 bytes. With room for so many
+    # more, they begin at the first address in it that is a multiple of 64.
     room = np.empty(len(numbers) + _WIDEST, np.float32)
-    # NumPy aligns to 16 bytes, a vector has up to 64.
     start = -room.ctypes.data % 64 // 4
     aligned = room[start : start + len(numbers)]
     aligned[:] = numbers
@@ -651,15 +730,22 @@ def _packed(layers: list[_Layer], weights: Weights) -> Floats:
 
 
 def _filled_up(layer: _Layer, weights: Weights) -> Floats:
+    """A layer as the kernel has it, [1 + inputs, outputs] in one dimension, biases first."""
     weight = weights[layer.weight]
     bias = np.zeros(len(weight)) if layer.bias is None else weights[layer.bias]
-    # [gates, outputs of a gate, inputs]; the gates of an LSTM are filled up one by one.
+    columns = np.column_stack([bias, weight])
+
+    # [gates, outputs of a gate, 1 + inputs], of which the kernel computes some.
     blocks = 1 if layer.gates == (0,) else 4
-    parts = np.column_stack([bias, weight])
-    parts = parts.reshape(blocks, len(weight) // blocks, -1)[list(layer.gates)]
-    missing = -parts.shape[1] % _WIDEST
-    padded = np.pad(parts, ((0, 0), (0, missing), (0, 0)))
-    return padded.reshape(-1, parts.shape[2]).T.astype(np.float32).ravel()
+    gates = columns.reshape(blocks, len(weight) // blocks, -1)
+    gates = gates[list(layer.gates)]
+
+    # Every gate is filled up by itself, so that it begins with a vector.
+    missing = -gates.shape[1] % _WIDEST
+    padded = np.pad(gates, ((0, 0), (0, missing), (0, 0)))
+
+    rows = padded.reshape(-1, gates.shape[2])
+    return rows.T.astype(np.float32).ravel()
 
 
 # From weights and their metadata
@@ -696,11 +782,14 @@ def calibrated_drivers(
             per-driver parameters.
     """
     source, weights, sizes, metadata, statistics = _fitted(config.path, "calibrated")
-    # Without a recorded change nobody changes lanes.
-    recorded = statistics.lane_changes.per_vehicle_km or 0.0
+
     # Only None asks for the recorded rate; 0 is a rate.
-    wishes = config.changes_per_km
-    wishes = WISH_PER_CHANGE * recorded if wishes is None else wishes
+    wishes_per_km = config.changes_per_km
+    if wishes_per_km is None:
+        # Without a recorded change nobody changes lanes.
+        recorded_per_km = statistics.lane_changes.per_vehicle_km or 0.0
+        wishes_per_km = WISH_PER_CHANGE * recorded_per_km
+
     return GeneratedDrivers(
         idm,
         sizes,
@@ -709,15 +798,23 @@ def calibrated_drivers(
         config.noise_scale,
         config.noise_period_s,
         anchor=fitted_anchor(metadata, source),
-        checked_changes=CalibratedChanges(wishes),
+        checked_changes=CalibratedChanges(wishes_per_km),
         headways_s=tuple(statistics.headway.quantile(level) for level in QUANTILE_LEVELS),
     )
 
 
 def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralChanges:
-    """Equations 9 to 11 with the numbers of all recordings given to the fit, held-out ones too."""
+    """Equations 9 to 11 with the numbers of all recordings given to the fit, held-out ones too.
+
+    Raises:
+        UserError: ``source``, which is named in the message, has no complete lane change.
+    """
     changes = statistics.lane_changes
-    numbers = (changes.t_m_srlc_steps, changes.lateral_speed.mean, changes.lateral_speed.sd)
+    numbers = (
+        changes.t_m_srlc_steps,
+        changes.lateral_speed.mean,
+        changes.lateral_speed.sd,
+    )
     # A number is missing if no change was recorded from beginning to end.
     if None in numbers:
         raise UserError(
@@ -751,9 +848,11 @@ def fitted_anchor(metadata: Mapping[str, Any], source: object) -> AnchorParamete
         UserError: impossible values.
     """
     # A file may lack these entries: then the defaults of the fit hold.
-    config = metadata["config"] if isinstance(metadata.get("config"), Mapping) else {}
+    stored = metadata.get("config")
+    config = stored if isinstance(stored, Mapping) else {}
     washout_s = config.get("washout_s", ANCHOR.washout_s)
     further_inputs = config.get("further_inputs", ANCHOR.further_inputs)
+
     # `not washout_s > 0` since NaN has to fail; `type` since True is no number of seconds.
     if type(washout_s) not in (int, float) or not washout_s > 0 or type(further_inputs) is not bool:
         raise UserError(
@@ -778,8 +877,9 @@ def pays(drivers: Drivers) -> bool:
 
 def faulty_drivers(drivers: RuleDrivers, faults: DriverFaults) -> RuleDrivers | None:
     """``drivers`` with ``faults``; None where they react later than the kernel can remember."""
-    late = _steps(faults.late_reaction.delay_s) > _MOST_STEPS
-    return None if late else replace(drivers, faults=faults)
+    if _steps(faults.late_reaction.delay_s) > _MOST_STEPS:
+        return None
+    return replace(drivers, faults=faults)
 
 
 def drivers_of(
@@ -812,13 +912,22 @@ def drivers_of(
         parts = traffic.parts()
         driven = {name: drivers_of(parts[name], idm, mobil, stream) for name in parts}
         drivers = mixed_drivers(driven, traffic.shares)
-    return blind(drivers, traffic.blind_share) if drivers and traffic.blind_share else drivers
+
+    if drivers is not None and traffic.blind_share:
+        return blind(drivers, traffic.blind_share)
+    return drivers
 
 
 def _fitted(
     path: str | None, preset: Any
 ) -> tuple[Path, Weights, GeneratorSizes, Mapping[str, Any], DrivingStatistics]:
-    """A generator's file, weights, sizes, metadata, and the statistics of its recordings."""
+    """A generator's file, weights, sizes, metadata, and the statistics of its recordings.
+
+    ``path`` None: the file that ships for the ``preset``.
+
+    Raises:
+        UserError: the weights are missing, foreign, of the other preset, or do not fit.
+    """
     # Imports the readers of recordings, a third of a second that rule-driven traffic does without.
     from ganlane.data.statistics import DrivingStatistics
 
@@ -839,10 +948,12 @@ def human_drivers(config: HumanTrafficConfig, idm: IdmParameters, stream: int) -
     source = Path(config.path or shipped_generator("human"))
     weights, metadata = load_arrays(source, GENERATOR)
     sizes = human_sizes(source, metadata)
-    policy = {
-        name.removeprefix("policy."): array
-        for name, array in weights.items()
-        if name.startswith("policy.")
-    }
+
+    # The file also holds the networks of the fit.
+    policy = {}
+    for name, array in weights.items():
+        if name.startswith("policy."):
+            policy[name.removeprefix("policy.")] = array
+
     _check_shapes(source, sizes, _human_layers(sizes), policy)
     return HumanDrivers(idm, sizes, policy, stream, part_of(config, HumanVariation))

@@ -102,7 +102,8 @@ def best_variant() -> str:
     try:
         # Asked of Linux, so that torch need not be imported.
         lines = CPU_INFO.read_text().splitlines()
-        parts = set(next(line for line in lines if line.startswith("flags")).split())
+        flags = next(line for line in lines if line.startswith("flags"))
+        parts = set(flags.split())
     except (OSError, StopIteration):  # not Linux
         import torch  # seconds to import
 
@@ -113,8 +114,10 @@ def best_variant() -> str:
 
 def compilers() -> tuple[tuple[str, ...], ...]:
     """Commands of the C++ compilers to try: that of the system, that of ``ziglang``."""
+    commands: list[tuple[str, ...]] = []
     path = runtime.find_compiler()
-    commands: list[tuple[str, ...]] = [] if path is None else [(path,)]
+    if path is not None:
+        commands.append((path,))
     if importlib.util.find_spec("ziglang"):
         commands.append((sys.executable, "-m", "ziglang", "c++"))
     return tuple(commands)
@@ -130,8 +133,9 @@ def find(variant: str | None = None) -> Loaded | str:
     """The library for this processor, or for ``variant``; or why there is none, as the end of a
     sentence.
 
-    That of the wheel, else one built by the first compiler that works. Once per process; a library
-    that is not the best of this processor, or is lost when the process ends, is told of.
+    That of the wheel, else one built by the first compiler that works, for the best instruction set
+    for which it does. Once per process; a library that is not the best of this processor, or is
+    lost when the process ends, is told of.
     """
     return _find(variant, compilers(), libraries_folder())
 
@@ -173,16 +177,25 @@ def load_for(rows: int) -> ctypes.CDLL:
 def _find(
     variant: str | None, commands: tuple[tuple[str, ...], ...], folder: Path | None
 ) -> Loaded | str:
+    """As :func:`find`; what the answer depends on are arguments, since it is stored."""
     if sys.platform == "win32":
         return "is not built for Windows"
-    names = list(VARIANTS)
-    variants = [variant] if variant else names[names.index(best_variant()) :]
+
+    if variant is not None:
+        variants = [variant]
+    else:
+        # The best one of this processor, and after it those that do with less.
+        names = list(VARIANTS)
+        variants = names[names.index(best_variant()) :]
+
     for name in variants:
         # That of the wheel fits only if it was built from these very sources.
         content = _whole(_prebuilt(name))
         if content is not None:
             with suppress(OSError):
-                return Loaded(_opened(_prebuilt(name), content), name, "the wheel", ())
+                library = _opened(_prebuilt(name), content)
+                return Loaded(library, name, "the wheel", ())
+
     # Of each compiler the last failure: the simplest instruction set's says most.
     troubles: dict[str, str] = {}
     for command in commands:
@@ -193,17 +206,22 @@ def _find(
             except (AttributeError, UserError) as error:
                 troubles[maker] = f"{maker} failed for {name} ({error})"
                 continue
-            except OSError as error:  # of no instruction set's
+            except OSError as error:  # no matter of the instruction set: on to the next compiler
                 troubles[maker] = (
                     f"{maker} or what it made does not run ({error}; where a folder forbids it, "
                     f"point {CACHE_VARIABLE} at another)"
                 )
                 break
+
             loaded = Loaded(library, name, maker, tuple(troubles.values()))
             if troubles:
-                line = f"env.kernel: the kernel for {name} by {maker} drives; "
-                print(f"{line}{'; '.join(loaded.troubles)}.", file=sys.stderr)
+                reasons = "; ".join(loaded.troubles)
+                print(
+                    f"env.kernel: the kernel for {name} by {maker} drives; {reasons}.",
+                    file=sys.stderr,
+                )
             return loaded
+
     reasons = "; ".join(troubles.values()) or "there is no C++ compiler"
     return f"cannot be built: {reasons}; {ADVICE}"
 
@@ -244,13 +262,20 @@ def _name(variant: str, *parts: str) -> str:
 
 
 def _flags(variant: str) -> tuple[str, ...]:
+    """What all compilers are told, and the environments per vector."""
     return (*FLAGS, f"-DLANES={VARIANTS[variant].lanes}")
 
 
 def _command(variant: str, compiler: tuple[str, ...]) -> tuple[str, ...]:
-    zig = ZIG_FLAGS if "ziglang" in compiler else ()
+    """The compiler's command line but the name of its output."""
     files = (str(source) for source in SOURCES if source.suffix == ".cpp")
-    return (*compiler, *_flags(variant), *zig, *VARIANTS[variant].flags, *files)
+    return (
+        *compiler,
+        *_flags(variant),
+        *(ZIG_FLAGS if "ziglang" in compiler else ()),
+        *VARIANTS[variant].flags,
+        *files,
+    )
 
 
 def _run(command: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
@@ -278,12 +303,15 @@ def _built(
         OSError: it cannot be run, or its library not be loaded from anywhere.
         AttributeError: its library lacks a function.
     """
-    command = _command(variant, compiler)
     # Another compiler, or another version of it, makes another library.
-    name = _name(variant, *command, _run((*compiler, "--version")).stdout)
+    command = _command(variant, compiler)
+    version = _run((*compiler, "--version")).stdout
+    name = _name(variant, *command, version)
+
     content = _whole(folder / name) if folder else None
     if content is None:
         content = _compiled(command)
+
     trouble = ""
     if folder:
         try:
@@ -291,11 +319,12 @@ def _built(
         except (OSError, UserError) as error:
             why = getattr(error, "strerror", None) or error
             trouble = f"{folder} cannot be used ({why}); point {CACHE_VARIABLE} at another"
+
     # Once loaded, the file may go.
     with tempfile.TemporaryDirectory(prefix="ganlane-") as temporary:
         library = _opened(Path(temporary) / name, content)
     if trouble:
-        # The folder's, then, and not the library's.
+        # The folder's, then, since the same library could be loaded from another.
         troubles["cache"] = trouble
     return library
 
@@ -304,16 +333,24 @@ def _whole(path: Path) -> bytes | None:
     """The content of a library; None if there is none, or it is damaged."""
     try:
         content = path.read_bytes()
-        return content if has_checksum(content, path) else None
+        whole = has_checksum(content, path)
     except (OSError, UserError):
         return None
+    return content if whole else None
 
 
 def _opened(path: Path, content: bytes) -> ctypes.CDLL:
-    """The library ``content``, loaded from ``path``, to which it is written if need be."""
+    """The library ``content``, loaded from ``path``, to which it is written if need be.
+
+    Raises:
+        UserError, OSError: it cannot be written there, or not be loaded.
+        AttributeError: it lacks a function.
+    """
     if _whole(path) != content:
         write_bytes(path, content)
     library = ctypes.CDLL(str(path))
+
+    # What each function takes: pointers, then the first row and the one after the last.
     for name, pointers in FUNCTIONS.items():
         function = getattr(library, f"ganlane_{name}")
         function.argtypes = [*[ctypes.c_void_p] * pointers, ctypes.c_long, ctypes.c_long]
@@ -333,8 +370,11 @@ def _compiled(command: tuple[str, ...]) -> bytes:
         done = _run((*command, "-o", str(path)))
         if done.returncode == 0 and path.is_file():
             return sealed(path.read_bytes() + PLACE.encode())
+
+    # The first line with an error, which the further ones may follow from.
     lines = done.stderr.strip().splitlines() or ["no message"]
-    raise UserError(next((line for line in lines if "error" in line), lines[-1])[:200])
+    message = next((line for line in lines if "error" in line), lines[-1])
+    raise UserError(message[:200])
 
 
 # Calls: arrays as pointers, rows shared between threads
@@ -388,16 +428,21 @@ def threads_allowed() -> int:
     Where torch is not loaded, :func:`ganlane.runtime.usable_threads`.
     """
     threads = kernel_threads.get()
-    torch = sys.modules.get("torch")
     if threads is not None:
         return threads
-    return usable_threads() if torch is None else int(torch.get_num_threads())
+
+    torch = sys.modules.get("torch")
+    if torch is None:
+        return usable_threads()
+    return int(torch.get_num_threads())
 
 
 def in_threads(
     rows: int, call: Callable[[int, int], int], rows_per_thread: int = ROWS_PER_THREAD
 ) -> None:
     """``call(first, last)`` for all ``rows``, in as many threads as pay and are allowed.
+
+    ``last`` is the row behind those of the call.
 
     Raises:
         ValueError: a call returned 2: an action is not 0, 1 or 2.
@@ -407,6 +452,7 @@ def in_threads(
     # Not asked for few rows: that takes as long as their decision.
     if threads > 1:
         threads = min(threads_allowed(), threads)
+
     if threads <= 1:
         code = call(0, rows)
     else:
@@ -417,8 +463,9 @@ def in_threads(
             pool.submit(call, start, min(start + share, rows))
             for start in range(share, rows, share)
         ]
-        # this thread does not wait idle
+        # This thread does not wait idle.
         code = max(call(0, share), *(other.result() for other in others))
+
     if code == 2:
         raise ValueError("an action is not 0, 1 or 2")
     if code:

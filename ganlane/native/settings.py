@@ -39,8 +39,9 @@ Floats = npt.NDArray[np.float32]
 
 def within(group: str, names: str | Iterable[str]) -> tuple[Key, ...]:
     """The keys of ``names`` in a group of the state."""
-    listed = names.split() if isinstance(names, str) else names
-    return tuple((group, name) for name in listed)
+    if isinstance(names, str):
+        names = names.split()
+    return tuple((group, name) for name in names)
 
 
 def _kinds(
@@ -93,6 +94,7 @@ COUNTERS: Final[dict[Key, str]] = dict.fromkeys((keys.SEED, keys.EPISODE, keys.S
 SET_SPEED: Final = (keys.EGO, keys.SET_SPEED)
 #: Who is on the road, which a decision changes where vehicles enter and leave.
 VALID: Final = (keys.VEHICLES, "valid")
+
 #: What goes into a decision, before the memory of generated drivers.
 INPUTS: Final = (
     keys.ACTION,
@@ -108,17 +110,20 @@ INPUTS: Final = (
     SET_SPEED,
     "rows",
 )
+
 #: What comes out of it, and out of the start of an episode.
 OUTPUTS: Final = (
     *within(keys.VEHICLES, "x y heading speed acceleration target_lane"),
     STEERING,
     *EGO_ARRAYS,
     keys.STEP,
+    # The flags of the end are behind the set speed.
     *(name for name in EVENT_ARRAYS if name not in keys.DONE_FLAGS),
     SET_SPEED,
     *keys.DONE_FLAGS,
     VALID,
 )
+
 #: Fields of ``vehicles`` that no decision changes: the start of an episode sets them.
 SCENE: Final = within(keys.VEHICLES, "length width desired_speed visibility valid")
 #: What the mask reads of the vehicles, and the view of the ego and of whom it sees; in the order of
@@ -163,22 +168,30 @@ class Layout:
             self.kinds[SET_SPEED] = "float32"
         self.kinds |= {name: kind for name, (kind, _) in memory.items()}
         self._memory = memory
-        # Rule-driven drivers' steering angles have their place among the others.
+
+        # Rule-driven drivers' steering angles have their place among the others, whatever their key
+        # in the memory; the rest of it follows in its own order.
         steering = next((name for name in memory if name[-1] == "steering"), STEERING)
+        further = [name for name in memory if name != steering]
+
+        self.inputs = [steering if name == STEERING else name for name in INPUTS] + further
+
         places: dict[Key, Key] = {STEERING: steering}
         if highway.flow is None:
             # The place of no array: a null pointer.
             places[VALID] = "valid"
-        further = [name for name in memory if name != steering]
-        self.inputs = [steering if name == STEERING else name for name in INPUTS] + further
         self.outputs = [places.get(name, name) for name in OUTPUTS] + further
+
         self.written = [name for name in self.outputs if name in self.kinds]
 
     def shape(self, name: Key, rows: int, vehicles: int) -> tuple[int, ...]:
-        """Shape of an array of ``kinds``."""
+        """Shape of an array of ``kinds`` for N ``rows`` of M ``vehicles``."""
         if name in self._memory:
-            return (rows, vehicles, *self._memory[name][1])
-        return (rows, vehicles) if name in VEHICLE_ARRAYS else (rows,)
+            _, behind = self._memory[name]
+            return (rows, vehicles, *behind)
+        if name in VEHICLE_ARRAYS:
+            return (rows, vehicles)
+        return (rows,)
 
 
 class Structure(ctypes.Structure):
@@ -258,8 +271,12 @@ class View(Structure):
     ]
 
     def numbers(self) -> int:
-        """Length of the observation: own state, lane view, own lane change, road, commands."""
-        return 5 + 6 * (4 if self.drift else 3) + (8 if self.road else 0) + self.control
+        """Length of the observation: own state and lane change, lane view, road, commands."""
+        # Lane view: ahead and behind in three lanes gap, nearness and relative speed, and with
+        # drift the place in the lane.
+        per_neighbour = 4 if self.drift else 3
+        road = 8 if self.road else 0
+        return 5 + 6 * per_neighbour + road + self.control
 
 
 class Range(Structure):
@@ -322,12 +339,16 @@ def filled(kind: type[Kind], numbers: Mapping[str, Any]) -> Kind:
     """A structure with those of the ``numbers`` that it has.
 
     A member that is a pointer is given what it points to: a structure, an array, or None.
+
+    Raises:
+        KeyError: a member is missing in the ``numbers``.
     """
     members = {}
     for name, member, *_ in kind._fields_:
         # A missing number is a KeyError here instead of a 0 in the kernel.
         value = numbers[name]
         members[name] = _address(value) if member is c_void_p else value
+
     structure = kind(**members)
     structure.pointed = numbers
     return structure
@@ -337,7 +358,9 @@ def _address(target: ctypes.Structure | ctypes.Array[Any] | Array | None) -> int
     """Where a structure or an array is; None: a null pointer."""
     if target is None:
         return None
-    return target.ctypes.data if isinstance(target, np.ndarray) else ctypes.addressof(target)
+    if isinstance(target, np.ndarray):
+        return target.ctypes.data
+    return ctypes.addressof(target)
 
 
 def range_of(bounds: tuple[float, float]) -> Range:
@@ -350,8 +373,12 @@ def actions_of(actions: ActionParameters, decision_period_s: float) -> Actions |
     """What the ego is commanded; None: lanes alone."""
     if actions.form == LANE:
         return None
-    form = (LANE_SPEED, CONTINUOUS).index(actions.form)
-    return filled(Actions, {**vars(actions), "form": form, "decision_period_s": decision_period_s})
+    numbers = {
+        **vars(actions),
+        "form": (LANE_SPEED, CONTINUOUS).index(actions.form),
+        "decision_period_s": decision_period_s,
+    }
+    return filled(Actions, numbers)
 
 
 def ends_of(
@@ -370,9 +397,13 @@ def ends_of(
             f"lanes={len(stretches)}: the native kernel has at most {_MOST_LANES} lanes on roads "
             "with lanes that end; set env.kernel=torch."
         )
+
+    # By where each lane has to be left, and how many changes the goal is away: for those who stay
+    # on the road, and for those who take the exit.
     goal = exit_lane(stretches)
     leave_by, changes = leaving(stretches)
     exit_by, exit_changes = leaving(stretches, goal)
+
     return Ends(
         begin=tuple(its.begin_m for its in stretches),
         end=tuple(its.end_m for its in stretches),
@@ -391,21 +422,28 @@ def flow_of(highway: Highway, period_s: float) -> Flow | None:
     flow = highway.flow
     if flow is None:
         return None
-    return filled(Flow, {**vars(flow), "arrival": flow.arrivals(highway.stretches, period_s)})
+    # Chance of a vehicle in each lane within a decision.
+    arrival = flow.arrivals(highway.stretches, period_s)
+    return filled(Flow, {**vars(flow), "arrival": arrival})
 
 
 def view_of(highway: Highway, scale: ObservationScale, form: str) -> View:
     """The numbers of an observation in :data:`NATIVE_FORMS`."""
+    drift, overlap, road = NATIVE_FORMS[form]
     numbers = {
+        **vars(scale),
+        **highway._asdict(),
         "nearness_m": NEARNESS_M,
         "overlap_m": OVERLAP_M,
         "sight_m": ROAD_SIGHT_M,
         "heading_rad": HEADING_RAD,
+        "drift": drift,
+        "overlap": overlap,
+        "road": road,
         "control": CONTROL_NUMBERS[highway.actions.form],
         "ends": ends_of(highway.stretches),
-        **dict(zip(("drift", "overlap", "road"), NATIVE_FORMS[form])),
     }
-    return filled(View, vars(scale) | highway._asdict() | numbers)
+    return filled(View, numbers)
 
 
 def spawn_of(
@@ -417,13 +455,21 @@ def spawn_of(
     recycle_share: float | None,
     scene: FixedScene | None = None,
 ) -> Spawn:
-    """The numbers of Table II, or of a ``scene``; ``recycle_share`` of the episodes recycle, None:
-    none does.
+    """The numbers of the first scene of an episode.
+
+    Args:
+        highway: the road and the number of vehicles.
+        spawn: Table II.
+        stream: family of episodes that the random numbers belong to.
+        ego_visibility, others_visibility: when others see a lane change of the ego, and of theirs.
+        recycle_share: of the episodes put vehicles left behind ahead again; None: none does.
+        scene: vehicles that stand in for those drawn from Table II.
     """
     numbers: dict[str, Any] = {}
     for name, value in vars(spawn).items():
         numbers[name] = range_of(value) if isinstance(value, tuple) else value
-    numbers |= highway._asdict() | {
+    numbers |= {
+        **highway._asdict(),
         "stream": stream,
         "ego_visibility": ego_visibility,
         "others_visibility": others_visibility,
@@ -438,10 +484,11 @@ def spawn_of(
 
 def _fixed_of(scene: FixedScene) -> Fixed:
     """The vehicles of a scene as arrays."""
-    # Its numbers in float64, rounded as the environment's float32 is.
-    base = {name: value.numpy()[0] for name, value in scene.base().as_dict().items()}
+    base = scene.base().as_dict()
     arrays = {}
     for name in _FIXED_ARRAYS.split():
-        kind = np.float32 if base[name].dtype == np.float64 else np.int64
-        arrays[name] = np.ascontiguousarray(base[name].astype(kind))
+        # The one scene [M]: its numbers in float64, rounded as the environment's float32 is.
+        column = base[name].numpy()[0]
+        kind = np.float32 if column.dtype == np.float64 else np.int64
+        arrays[name] = np.ascontiguousarray(column.astype(kind))
     return filled(Fixed, vars(scene) | arrays)

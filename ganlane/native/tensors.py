@@ -1,6 +1,8 @@
 """The kernel on tensors, on a CPU in float32.
 
-A decision, first scenes, the lane view and the mask ``safe``.
+What the TorchRL environment calls, each the fast twin of tensor code: a decision (:class:`Kernel`),
+first scenes (:class:`NativeScenes`), the observation (:class:`LaneView`) and the mask ``safe``
+(:class:`SafeActions`).
 """
 
 from __future__ import annotations
@@ -46,50 +48,69 @@ def _room(
     """Tensors for the kernel to write to, by ``torch.empty`` or ``torch.zeros``."""
     room = {}
     for name in names:
-        # As the environment has its events and flags.
-        column = (1,) if name in settings.EVENT_ARRAYS else ()
-        shape = layout.shape(name, rows, vehicles) + column
-        room[name] = make(shape, dtype=getattr(torch, layout.kinds[name]))
+        shape = layout.shape(name, rows, vehicles)
+        # The environment has its events and flags as [N, 1].
+        if name in settings.EVENT_ARRAYS:
+            shape += (1,)
+        dtype = getattr(torch, layout.kinds[name])
+        room[name] = make(shape, dtype=dtype)
     return room
 
 
 def _state(tensors: Mapping[Key, Tensor]) -> TensorDict:
     """The environment's state [N], without a reward; the kernel drives no scene to its end."""
-    size = tensors[keys.STEP].shape
-    # Only recorded scenes end by themselves; the flag is there so that all states have the same
-    # keys.
-    scene_end = torch.zeros_like(tensors[keys.EVENTS, "timeout"])
     groups: dict[str, Any] = {}
-    for key, value in [*tensors.items(), ((keys.EVENTS, "scene_end"), scene_end)]:
+    for key, tensor in tensors.items():
+        # Into the mapping of its group, ("vehicles", "x") into groups["vehicles"].
         *path, name = (key,) if isinstance(key, str) else key
         group = groups
         for part in path:
             group = group.setdefault(part, {})
-        group[name] = value
+        group[name] = tensor
+
+    # Only recorded scenes end by themselves; the flag is there so that all states have the same
+    # keys.
+    events = groups[keys.EVENTS]
+    events["scene_end"] = torch.zeros_like(events["timeout"])
+
+    size = tensors[keys.STEP].shape
     return _tensordict(groups, size)
 
 
 def _tensordict(groups: Mapping[str, Any], size: torch.Size) -> TensorDict:
     """Nested mappings as a TensorDict [N] on the CPU."""
-    fields = {
-        name: _tensordict(value, size) if isinstance(value, dict) else value
-        for name, value in groups.items()
-    }
+    fields = {}
+    for name, value in groups.items():
+        fields[name] = _tensordict(value, size) if isinstance(value, dict) else value
+
     # Made without TensorDict's checks, since every shape is known.
     return TensorDict._new_unsafe(fields, batch_size=size, device=torch.device("cpu"))
 
 
 def _highway(road: Road, vehicles: int, actions: ActionParameters | None = None) -> Highway:
-    """What the kernel is told of the road, M and the actions (None: lanes)."""
-    # The settings have one number of lanes and one width for all rows.
-    lanes, width_m = road.lanes, road.lane_width_m
+    """What the kernel is told of the road, M and the actions (None: lanes).
+
+    Raises:
+        UserError: the road is a ring or differs from row to row.
+    """
+    lanes = road.lanes
+    width_m = road.lane_width_m
+
+    # The kernel has one number of lanes and one width for all rows.
     if isinstance(lanes, Tensor) or isinstance(width_m, Tensor) or road.ring_m is not None:
         raise UserError(
             "env.kernel=native: the road must be straight and the same in all rows; "
             "set env.kernel=torch."
         )
-    commands = actions or ActionParameters()
-    return Highway(lanes, width_m, vehicles, road.stretches, road.flow, commands)
+
+    return Highway(
+        lanes=lanes,
+        lane_width_m=width_m,
+        vehicles=vehicles,
+        stretches=road.stretches,
+        flow=road.flow,
+        actions=actions or ActionParameters(),
+    )
 
 
 class _Remade:
@@ -132,14 +153,21 @@ class _Function(_Remade):
     def run(
         self, rows: int, inputs: Iterable[Tensor | None], outputs: Sequence[Tensor | None]
     ) -> None:
-        """Call it on ``rows`` rows, with its arrays in the kernel's order."""
+        """Call it on ``rows`` rows, with its arrays in the kernel's order.
+
+        ``outputs`` are contiguous, and written to; None: an array that the highway lacks.
+        """
         # The contiguous copies have to live until the call is over.
         read = [tensor if tensor is None else tensor.contiguous() for tensor in inputs]
-        pointers = (ctypes.byref(self._numbers), addresses(read), addresses(outputs))
-        # ctypes releases Python's lock during a call, so threads run side by side.
-        in_threads(
-            rows, lambda first, last: self._call(*pointers, first, last), self._rows_per_thread
+        call_rows = partial(
+            self._call,
+            ctypes.byref(self._numbers),
+            addresses(read),
+            addresses(outputs),
         )
+
+        # ctypes releases Python's lock during a call, so threads run side by side.
+        in_threads(rows, call_rows, self._rows_per_thread)
 
 
 class _Parts(_Remade):
@@ -191,8 +219,13 @@ class Kernel(_Parts):
         self._functions = []
         for part in self.parts:
             numbers = decision_settings(highway, part.drivers, episode, ego, mobil)
-            per_thread = rows_per_thread(part.drivers)
-            self._functions.append(_Function("ganlane_decide", numbers, variant, per_thread))
+            function = _Function(
+                "ganlane_decide",
+                numbers,
+                variant,
+                rows_per_thread(part.drivers),
+            )
+            self._functions.append(function)
 
     def decide(
         self, action: Tensor, state: TensorDictBase, recycles: Tensor | None = None
@@ -211,41 +244,55 @@ class Kernel(_Parts):
         """
         rows = action.shape[0]
         layout = self.layout
-        arrays: dict[Key, Tensor | None] = {"recycles": recycles, keys.ACTION: action}
+
+        # What the kernel reads, by key; for what is missing it gets null pointers.
+        before: dict[Key, Tensor | None] = {"recycles": recycles}
         if self._controls:
-            arrays |= {keys.ACTION: None, "controls": action.float()}
+            before[keys.ACTION] = None
+            before["controls"] = action.float()
+        else:
+            before[keys.ACTION] = action
+
         for name in layout.inputs:
-            if name in arrays or name not in layout.kinds:
+            if name in before or name not in layout.kinds:
                 continue
             # Group by group: to look up a nested key takes three times as long.
-            number: Any = state
+            tensor: Any = state
             for part in (name,) if isinstance(name, str) else name:
-                number = number.get(part)
+                tensor = tensor.get(part)
             # A wrong type would be read as other numbers, without an error.
             dtype = getattr(torch, layout.kinds[name])
-            if number.dtype is not dtype or number.shape[0] != rows:
+            if tensor.dtype is not dtype or tensor.shape[0] != rows:
                 raise TypeError(
                     f"the kernel takes {rows} rows of {dtype} as {name}, "
-                    f"not {number.dtype} {number.shape}"
+                    f"not {tensor.dtype} {tensor.shape}"
                 )
-            arrays[name] = number
+            before[name] = tensor
+
         # New tensors: the state before the decision belongs to the caller.
         after = _room(layout, layout.written, rows, self.vehicles, torch.empty)
+
         several = len(self.parts) > 1
         if several:
-            # What a part does not write is as it was.
+            # A part writes the memory of its own rows alone; in the others it is as it was.
             for name in layout.written:
                 if name[0] == keys.TRAFFIC:
-                    after[name] = arrays[name].clone()  # type: ignore[union-attr]
-        for number, (function, of_part) in enumerate(zip(self._functions, self.layouts)):
+                    after[name] = before[name].clone()  # type: ignore[union-attr]
+
+        for number, function in enumerate(self._functions):
             if several:
-                chosen = self.of_part(number, state.get(keys.EPISODE))
-                arrays["rows"] = numbers = chosen.nonzero()[:, 0]
-                rows = len(numbers)
-            outputs = [after.get(name) for name in of_part.outputs]
-            function.run(rows, map(arrays.get, of_part.inputs), outputs)
+                # The kernel drives the rows in this list.
+                belongs = self.of_part(number, state.get(keys.EPISODE))
+                chosen = belongs.nonzero()[:, 0]
+                before["rows"] = chosen
+                rows = len(chosen)
+            part_layout = self.layouts[number]
+            inputs = [before.get(name) for name in part_layout.inputs]
+            outputs = [after.get(name) for name in part_layout.outputs]
+            function.run(rows, inputs, outputs)
+
         # What no decision changes is shared with the state before, not copied.
-        lasting = {name: arrays[name] for name in (*settings.SCENE, keys.SEED, keys.EPISODE)}
+        lasting = {name: before[name] for name in (*settings.SCENE, keys.SEED, keys.EPISODE)}
         return _state(lasting | after)  # type: ignore[arg-type]
 
 
@@ -273,13 +320,24 @@ class NativeScenes(_Parts):
         super().__init__(drivers, highway)
         self._functions = []
         for part in self.parts:
-            others = scenes.others_visibility
-            others = part.drivers.visibility if others == VISIBILITY_OF_EPISODE else others
-            start = (stream, scenes.ego_visibility, others, None)
-            spawn = settings.spawn_of(highway, scenes.parameters, *start)
+            others_visibility = scenes.others_visibility
+            if others_visibility == VISIBILITY_OF_EPISODE:
+                others_visibility = part.drivers.visibility
+            spawn = settings.spawn_of(
+                highway,
+                scenes.parameters,
+                stream,
+                scenes.ego_visibility,
+                others_visibility,
+                recycle_share=None,
+            )
             enter = decision_settings(highway, part.drivers)
+
             # The scene first, then the drivers' memory of it.
-            functions = (_Function("ganlane_spawn", spawn), _Function("ganlane_enter", enter))
+            functions = (
+                _Function("ganlane_spawn", spawn),
+                _Function("ganlane_enter", enter),
+            )
             self._functions.append(functions)
 
     def start(self, seed: Tensor, episode: Tensor, rows: Tensor | None = None) -> TensorDict:
@@ -287,17 +345,23 @@ class NativeScenes(_Parts):
 
         ``rows`` [N] bool are those to be drawn; None: all. The others are zeros, without a vehicle.
         """
-        rows = torch.ones_like(seed, dtype=torch.bool) if rows is None else rows
-        layout = self.layout
+        if rows is None:
+            rows = torch.ones_like(seed, dtype=torch.bool)
+
         # Zeros, since rows that are not drawn are not written.
+        layout = self.layout
         names = (*layout.written, *settings.SCENE)
         state = _room(layout, names, len(seed), self.vehicles, torch.zeros)
-        state |= {keys.SEED: seed, keys.EPISODE: episode}
+        state[keys.SEED] = seed
+        state[keys.EPISODE] = episode
+
         for number, functions in enumerate(self._functions):
-            # Whether it recycles is drawn with the scene, but the environment draws it, too.
-            flags = {"recycles": torch.zeros_like(rows)}
-            flags["fresh"] = rows & self.of_part(number, episode)
-            inputs = [(state | flags)[name] for name in settings.STARTS]
+            arrays = state | {
+                "fresh": rows & self.of_part(number, episode),
+                # Whether it recycles is drawn with the scene, but the environment draws it, too.
+                "recycles": torch.zeros_like(rows),
+            }
+            inputs = [arrays[name] for name in settings.STARTS]
             outputs = [state.get(name) for name in self.layouts[number].outputs]
             for function in functions:
                 function.run(len(seed), inputs, outputs)
@@ -316,7 +380,8 @@ class LaneView(_Function):
     """
 
     def __init__(self, road: Road, vehicles: int, scale: ObservationScale, form: str) -> None:
-        view = settings.view_of(_highway(road, vehicles), scale, form)
+        highway = _highway(road, vehicles)
+        view = settings.view_of(highway, scale, form)
         self.size = view.numbers()
         super().__init__("ganlane_lane_view", view)
 
@@ -327,14 +392,23 @@ class LaneView(_Function):
 
         Arguments as :meth:`ganlane.transforms.ObservationTransform.observe`.
         """
-        v = vehicles
-        # In the order of observation.cpp: the ego as it is, the others as they are seen.
-        inputs = [getattr(v, name) for name in settings.VIEWED_EGO.split()]
-        inputs += [getattr(seen, name) for name in settings.VIEWED.split()]
-        inputs += [progress, direction, v.x, v.heading, None]
-        out = torch.empty((len(v.x), self.size), dtype=torch.float32)
-        self.run(len(out), inputs, [out])
-        return out
+        # In the order of observation.cpp: the ego as it is, the others as they are seen. In the
+        # place of the set speed there is none: the transform adds what a driver needs for more
+        # than lanes.
+        inputs = [
+            *(getattr(vehicles, name) for name in settings.VIEWED_EGO.split()),
+            *(getattr(seen, name) for name in settings.VIEWED.split()),
+            progress,
+            direction,
+            vehicles.x,
+            vehicles.heading,
+            None,
+        ]
+
+        rows = len(vehicles.x)
+        observation = torch.empty((rows, self.size), dtype=torch.float32)
+        self.run(rows, inputs, [observation])
+        return observation
 
 
 class SafeActions(_Function):
@@ -353,7 +427,8 @@ class SafeActions(_Function):
     def __init__(
         self, road: Road, vehicles: int, idm: IdmParameters, mask: MaskParameters, abort: bool
     ) -> None:
-        numbers = mask_settings(_highway(road, vehicles), idm, mask, abort)
+        highway = _highway(road, vehicles)
+        numbers = mask_settings(highway, idm, mask, abort)
         super().__init__("ganlane_mask", numbers)
 
     def allowed(self, seen: Vehicles, direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -362,9 +437,14 @@ class SafeActions(_Function):
         ``seen`` are the vehicles as the ego perceives them, ``direction`` [N] that of its current
         lane change.
         """
+        # In the order of mask.cpp.
+        inputs = [
+            *(getattr(seen, name) for name in settings.MASKED.split()),
+            direction,
+        ]
+
         rows = len(seen.x)
-        inputs = [getattr(seen, name) for name in settings.MASKED.split()]
-        mask = torch.empty(rows, 3, dtype=torch.bool)
-        none = torch.empty(rows, dtype=torch.bool)
-        self.run(rows, [*inputs, direction], [mask, none])
-        return mask, none
+        mask = torch.empty(rows, keys.ACTIONS, dtype=torch.bool)
+        no_safe_action = torch.empty(rows, dtype=torch.bool)
+        self.run(rows, inputs, [mask, no_safe_action])
+        return mask, no_safe_action

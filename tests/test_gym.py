@@ -275,6 +275,12 @@ def begun(env):
             lambda: make_vec(2).reset(options={"reset_mask": np.array([1, 0])}),
             r"a boolean array of shape \(2,\)",
         ),
+        (
+            lambda: begun(make_vec(2)).reset(
+                seed=3, options={"reset_mask": np.array([True, False])}
+            ),
+            "leave out seed and episode",
+        ),
         (lambda: begun(make()).step(3), r"0 \(keep\), 1 \(left\) or 2 \(right\)"),
         (lambda: begun(make_vec(2)).step(np.zeros(3, int)), "expected 2 whole number"),
         (lambda: begun(make_vec(2)).step([[0, 1], [2]]), r"expected \d whole number"),

@@ -125,10 +125,15 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
             Observations [N, D] and info, both the caller's to keep.
 
         Raises:
-            UserError: a wrong value, or a mask before the first reset.
+            UserError: a wrong value, or a mask before the first reset or beside a seed or episode.
         """
         chosen = reset_options(options, ("episode", "reset_mask"))
         if "reset_mask" in chosen:
+            if seed is not None or "episode" in chosen:
+                raise UserError(
+                    "reset(): with reset_mask each of its rows begins its next episode; leave out "
+                    "seed and episode, or reset all rows."
+                )
             fresh = array_of(chosen["reset_mask"])
             if fresh.shape != (self.num_envs,) or fresh.dtype != np.bool_:
                 raise UserError(

@@ -445,7 +445,7 @@ def in_threads(
     ``last`` is the row behind those of the call.
 
     Raises:
-        ValueError: a call returned 2: an action is not 0, 1 or 2.
+        ValueError: a call returned 2: there is no such action.
         MemoryError: a call returned 1.
     """
     threads = rows // rows_per_thread
@@ -467,7 +467,7 @@ def in_threads(
         code = max(call(0, share), *(other.result() for other in others))
 
     if code == 2:
-        raise ValueError("an action is not 0, 1 or 2")
+        raise ValueError("an action is none of those that there are, or no finite number")
     if code:
         raise MemoryError("the kernel's scratch memory")
 

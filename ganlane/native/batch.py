@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,15 +107,13 @@ class _Part(NamedTuple):
 
     def call(self, function: Callable[..., int], count: int) -> None:
         """Call a function of the kernel that works on a whole batch, on ``count`` rows."""
-        # One pointer is all that it passes. Rows are independent, so any split between threads
-        # gives the same numbers.
-        in_threads(count, partial(function, self.pointer), self.rows_per_thread)
+        in_threads(count, function, (self.pointer,), self.rows_per_thread)
 
     def drive(self, decide: Callable[..., int], count: int) -> None:
         """Call the kernel's ``decide`` on the first ``count`` of ``rows``."""
         batch = self.batch
-        decide_part = partial(decide, batch.settings, batch.inputs, batch.outputs)
-        in_threads(count, decide_part, self.rows_per_thread)
+        pointers = (batch.settings, batch.inputs, batch.outputs)
+        in_threads(count, decide, pointers, self.rows_per_thread)
 
 
 class NativeBatch:

@@ -21,8 +21,7 @@ import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
@@ -39,7 +38,16 @@ SOURCES = tuple(sorted(Path(__file__).parent.glob("*.[ch]pp")))
 PREBUILT = Path(__file__).with_name("prebuilt")
 #: -ffp-contract=off: a product and a sum stay two roundings, so that every instruction set gives
 #: the same bits.
-FLAGS = ("-O3", "-std=c++17", "-ffp-contract=off", "-fno-exceptions", "-fPIC", "-shared", "-s")
+FLAGS = (
+    "-O3",
+    "-std=c++17",
+    "-ffp-contract=off",
+    "-fno-exceptions",
+    "-fPIC",
+    "-pthread",
+    "-shared",
+    "-s",
+)
 #: The kernel needs no C++ library; zig would compile one first, which takes minutes. Without
 #: ``-mcpu`` it would compile for the processor that it runs on.
 ZIG_FLAGS = ("-nostdinc++", "-nostdlib++", "-mcpu=baseline")
@@ -58,6 +66,7 @@ FUNCTIONS = {
     "judge": 1,
     "start": 1,
 }
+_MOST_POINTERS = max(FUNCTIONS.values())
 #: What Linux knows of the processor.
 CPU_INFO = Path("/proc/cpuinfo")
 
@@ -351,10 +360,15 @@ def _opened(path: Path, content: bytes) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
 
     # What each function takes: pointers, then the first row and the one after the last.
+    shares = library.ganlane_in_threads
+    number = [ctypes.c_long] * 2
+    shares.argtypes = [ctypes.c_void_p, ctypes.c_int, *[ctypes.c_void_p] * _MOST_POINTERS, *number]
+    shares.restype = ctypes.c_int
     for name, pointers in FUNCTIONS.items():
         function = getattr(library, f"ganlane_{name}")
         function.argtypes = [*[ctypes.c_void_p] * pointers, ctypes.c_long, ctypes.c_long]
         function.restype = ctypes.c_int
+        function.in_threads = shares  # type: ignore[attr-defined]
     return library
 
 
@@ -379,10 +393,10 @@ def _compiled(command: tuple[str, ...]) -> bytes:
 
 # Calls: arrays as pointers, rows shared between threads
 
-#: Rows per thread from which on a second thread pays: idm_mobil through gymnasium on two cores took
-#: 1.3 times as long with two threads at 128 rows, 1.0 times at 256, 0.8 times at 512, 0.65 times at
-#: 1024 and 0.55 times at 4096.
-ROWS_PER_THREAD = 192
+#: Rows per thread from which on a second thread pays, also where it has gone to sleep since the
+#: last call. Two threads took, of one's time with idm_mobil through gymnasium on two cores, 0.7 at
+#: 128 rows, 0.65 at 256 and 0.55 at 1024; where every step was followed by a pause, 1.4, 1.0, 0.7.
+ROWS_PER_THREAD = 128
 #: The largest number of environments in a vector; threads take a multiple of it. A decision of so
 #: many rows of generated traffic takes 2 ms, so that is what a thread pays for there.
 BLOCK = 16
@@ -438,11 +452,20 @@ def threads_allowed() -> int:
 
 
 def in_threads(
-    rows: int, call: Callable[[int, int], int], rows_per_thread: int = ROWS_PER_THREAD
+    rows: int,
+    function: Any,
+    pointers: Sequence[Any],
+    rows_per_thread: int = ROWS_PER_THREAD,
 ) -> None:
-    """``call(first, last)`` for all ``rows``, in as many threads as pay and are allowed.
+    """Call a function of the library on all ``rows``, in as many threads as pay and are allowed.
 
-    ``last`` is the row behind those of the call.
+    Rows are independent, so any split between threads gives the same numbers.
+
+    Args:
+        rows: how many there are.
+        function: of a library that :func:`load` gave.
+        pointers: what it takes before the first and the last row.
+        rows_per_thread: from which on a further thread pays.
 
     Raises:
         ValueError: a call returned 2: there is no such action.
@@ -453,30 +476,17 @@ def in_threads(
     if threads > 1:
         threads = min(threads_allowed(), threads)
 
+    # ctypes releases Python's lock during a call.
     if threads <= 1:
-        code = call(0, rows)
+        code = function(*pointers, 0, rows)
     else:
         # Rounded up to whole vectors, so that no two threads share one.
         share = -(-rows // (threads * BLOCK)) * BLOCK
-        pool = _pool(threads - 1)
-        others = [
-            pool.submit(call, start, min(start + share, rows))
-            for start in range(share, rows, share)
-        ]
-        # This thread does not wait idle.
-        code = max(call(0, share), *(other.result() for other in others))
+        padding = [None] * (_MOST_POINTERS - len(pointers))
+        shared = [len(pointers), *pointers, *padding]
+        code = function.in_threads(ctypes.cast(function, ctypes.c_void_p), *shared, rows, share)
 
     if code == 2:
         raise ValueError("an action is none of those that there are, or no finite number")
     if code:
         raise MemoryError("the kernel's scratch memory")
-
-
-@lru_cache(maxsize=1)
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="ganlane-native")
-
-
-if hasattr(os, "register_at_fork"):
-    # A forked child has the pool's object but none of its threads.
-    os.register_at_fork(after_in_child=_pool.cache_clear)

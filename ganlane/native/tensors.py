@@ -159,15 +159,8 @@ class _Function(_Remade):
         """
         # The contiguous copies have to live until the call is over.
         read = [tensor if tensor is None else tensor.contiguous() for tensor in inputs]
-        call_rows = partial(
-            self._call,
-            ctypes.byref(self._numbers),
-            addresses(read),
-            addresses(outputs),
-        )
-
-        # ctypes releases Python's lock during a call, so threads run side by side.
-        in_threads(rows, call_rows, self._rows_per_thread)
+        pointers = (ctypes.byref(self._numbers), addresses(read), addresses(outputs))
+        in_threads(rows, self._call, pointers, self._rows_per_thread)
 
 
 class _Parts(_Remade):

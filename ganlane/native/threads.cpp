@@ -45,7 +45,7 @@ struct Pool {
     pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;    // of all below
     pthread_cond_t begins = PTHREAD_COND_INITIALIZER, is_done = PTHREAD_COND_INITIALIZER;
     Call call = {};
-    long turn = 0;                 // counts calls
+    long turn = 0;                 // counts calls; this and `open` are looked at without the lock, too
     int parts = 0;                 // of the present call; the caller does the first one
     int open = 0;                  // of them, those of workers that have not finished
     int code = 0;                  // the largest that a worker's part returned
@@ -70,7 +70,7 @@ void* work(void* number) {
         int code = on_rows(call, first, last < call.rows ? last : call.rows);
         pthread_mutex_lock(&pool.lock);
         if (code > pool.code) pool.code = code;
-        if (--pool.open == 0) pthread_cond_signal(&pool.is_done);
+        if (__atomic_sub_fetch(&pool.open, 1, __ATOMIC_RELEASE) == 0) pthread_cond_signal(&pool.is_done);
         pthread_mutex_unlock(&pool.lock);
     }
 }
@@ -112,7 +112,7 @@ extern "C" int ganlane_in_threads(void* function, int pointers, const void* firs
     pool.parts = parts;
     pool.open = parts - 1;
     pool.code = 0;
-    pool.turn++;
+    __atomic_add_fetch(&pool.turn, 1, __ATOMIC_RELEASE);
     pthread_cond_broadcast(&pool.begins);
     pthread_mutex_unlock(&pool.lock);
     int code = on_rows(call, 0, share);

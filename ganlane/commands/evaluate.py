@@ -10,6 +10,7 @@ import polars as pl
 
 from ganlane import evaluation
 from ganlane.build import make_drivers
+from ganlane.evaluation.results import seeds_of
 from ganlane.evaluation.statistics import entries
 from ganlane.evaluation.table import show
 from ganlane.settings.commands import EvaluateConfig, RunConfig
@@ -23,12 +24,7 @@ def evaluate(config: EvaluateConfig, folder: Path) -> str:
     """
     drivers = make_drivers(config.agents, config.env, config.device)
     table = compare(drivers, config)
-    seeds = {
-        "stream": config.stream,
-        "seed": config.seed,
-        "episodes": [0, config.episodes - 1],
-    }
-    return publish(table, folder, config, seeds)
+    return publish(table, folder, config, seeds_of(config))
 
 
 def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:

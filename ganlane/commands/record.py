@@ -20,6 +20,7 @@ from ganlane.build import make_driver
 from ganlane.config.run import cleared_after_mistakes
 from ganlane.errors import UserError
 from ganlane.evaluation import write_results
+from ganlane.evaluation.results import seeds_of
 from ganlane.files import whole_folder
 from ganlane.gym import ENV_ID
 from ganlane.gym.rows import row_of
@@ -101,12 +102,7 @@ def record(config: RecordConfig, folder: Path) -> str:
         "root": str(root),
         **facts,
     }
-    seeds = {
-        "stream": config.stream,
-        "seed": config.seed,
-        "episodes": [0, config.episodes - 1],
-    }
-    write_results(folder, numbers, config, seeds)
+    write_results(folder, numbers, config, seeds_of(config))
     print(", ".join(f"{key.replace('_', ' ')} {value}" for key, value in facts.items()))
     return f"dataset: minari.load_dataset({name!r}) with MINARI_DATASETS_PATH={root}"
 

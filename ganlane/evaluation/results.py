@@ -67,6 +67,17 @@ class TrainingRun(Run):
     table: pl.DataFrame
 
 
+def seeds_of(config: Any) -> dict[str, Any]:
+    """What :func:`write_results` is told of the episodes of a command that drives the first ones of
+    its seed.
+    """
+    return {
+        "stream": config.stream,
+        "seed": config.seed,
+        "episodes": [0, config.episodes - 1],
+    }
+
+
 def write_results(
     folder: str | Path,
     numbers: Mapping[str, Any],

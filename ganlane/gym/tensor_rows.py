@@ -142,19 +142,10 @@ class TensorRows(Rows):
         # Counted in physics steps, so that it has no sum of rounding errors.
         time_s = self.array(keys.STEP) * keys.PHYSICS_STEP_S
 
-        # Numbers that all rows share become [1], those of recorded scenes, [N, 1], become [N].
-        road = self._road()
-        lanes = _array(torch.as_tensor(road.lanes).flatten())
-        width_m = _array(torch.as_tensor(road.lane_width_m).flatten())
-
-        # Lane 0 has its centre at y = 0. Computed in the float type of the run, as the road does,
-        # so that both round alike.
-        y_m = self.array((keys.VEHICLES, "y"))
-        nearest = np.rint(y_m / width_m.astype(y_m.dtype))
-
-        # An ego that has left the road is in the outer lane.
-        lane = np.minimum(np.maximum(nearest, 0.0), lanes - 1)
-        return time_s, lane.astype(np.int64)
+        # Of an ego that has left the road it is the outer lane.
+        y_m = self.now().get((keys.VEHICLES, "y"))[:, :1]
+        lane = self._road().lane_of(y_m)
+        return time_s, _array(lane[:, 0].long())
 
     def _road(self) -> Road:
         """The road of the rows: of their recorded scenes, else that of the settings."""

@@ -23,7 +23,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -368,7 +368,8 @@ def _opened(path: Path, content: bytes) -> ctypes.CDLL:
         function = getattr(library, f"ganlane_{name}")
         function.argtypes = [*[ctypes.c_void_p] * pointers, ctypes.c_long, ctypes.c_long]
         function.restype = ctypes.c_int
-        function.in_threads = shares  # type: ignore[attr-defined]
+        address = ctypes.cast(function, ctypes.c_void_p)
+        function.in_threads = partial(shares, address, pointers)  # type: ignore[attr-defined]
     return library
 
 
@@ -483,8 +484,7 @@ def in_threads(
         # Rounded up to whole vectors, so that no two threads share one.
         share = -(-rows // (threads * BLOCK)) * BLOCK
         padding = [None] * (_MOST_POINTERS - len(pointers))
-        shared = [len(pointers), *pointers, *padding]
-        code = function.in_threads(ctypes.cast(function, ctypes.c_void_p), *shared, rows, share)
+        code = function.in_threads(*pointers, *padding, rows, share)
 
     if code == 2:
         raise ValueError("an action is none of those that there are, or no finite number")

@@ -72,19 +72,21 @@ def compare(
 
     # All traffics are made first, so that one that cannot be made shows before any driving.
     modules = {}
+    episodes: dict[str, Sequence[int]] = {}
     for name, option in config.traffics.items():
-        modules[name] = make_traffic(option, env, stream)
+        module = make_traffic(option, env, stream)
+        modules[name] = module
+        episodes[name] = range(config.episodes)
+        if isinstance(module, ReplayTraffic):
+            episodes[name] = module.episodes_once(seed, env.idm)[: config.episodes]
 
     # One table per driver and traffic, concatenated at the end.
     tables = []
-    total = len(modules) * len(drivers) * config.episodes
+    total = len(drivers) * sum(map(len, episodes.values()))
     no_terminal = not sys.stderr.isatty()
     with tqdm(total=total, unit="episode", disable=quiet or no_terminal) as bar:
         for traffic, module in modules.items():
-            numbers: Sequence[int] = range(config.episodes)
-            if isinstance(module, ReplayTraffic):
-                numbers = module.episodes_once(seed, env.idm)[: config.episodes]
-
+            numbers = episodes[traffic]
             for driver in drivers:
                 title = f"{driver.name} on {traffic}"
                 bar.set_description(title)

@@ -37,6 +37,8 @@ _LENGTH_M = 4.5
 _WIDTH_M = 2.0
 #: No leader comes nearer, or gets away, by more than this within 0.1 s, m.
 _JUMP_M = 2.0
+#: A leader that the radar shows for less than this is none, but another echo, s.
+_ECHO_S = 1.0
 #: Columns that two of the files have in common.
 _NUMBERS = {
     "vehicle": pl.Int64,
@@ -160,6 +162,9 @@ def _instrumented(path: Path) -> pl.DataFrame:
         x=pl.col("x") + pl.col("gap") + _LENGTH_M,
         driven=False,
     )
+    # A single position would be a car that stands.
+    seen_s = FRAME_S * pl.len().over("scene", "vehicle")
+    leaders = leaders.filter(seen_s >= _ECHO_S)
     # Numbers of vehicles come in two types.
     cars = pl.concat([follower, leaders], how="diagonal_relaxed")
     return cars.with_columns(length=_LENGTH_M)

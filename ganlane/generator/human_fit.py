@@ -3,7 +3,7 @@
 Cloning alone drifts, since a clone never sees its own mistakes. So the policy drives the recorded
 scenes itself: of several moves that it draws, the nearest to the recording is made, and the target
 is what leads back to it. Where recordings are silent (fast, free, standing, about to collide, off
-the lane) samples of IDM drivers with headways of their own stand in.
+the lane) samples of drivers with headways of their own stand in, who follow a simple law.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from ganlane.generator.human import (
     ACCELERATIONS,
     ACROSS,
     ALONG,
+    SAME,
     HumanPolicy,
     Memory,
     Situation,
@@ -47,9 +48,9 @@ from ganlane.generator.human_samples import (
     smooth_scene,
     without_noise,
 )
-from ganlane.generator.human_tuning import Report, begins_per_decision, tune
+from ganlane.generator.human_tuning import NO_LIMIT_MPS, Report, begins_per_decision, tune
 from ganlane.settings.generator import HumanConfig
-from ganlane.sim.idm import IdmParameters, following_acceleration, with_headways
+from ganlane.sim.idm import IdmParameters, following_acceleration
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.state import Road, Vehicles
 
@@ -64,6 +65,25 @@ ONE_LANE_WEIGHT = 0.5
 PRIOR_SCENES = 9000
 #: Vehicles in each of them.
 PRIOR_VEHICLES = 8
+
+#: Above this speed, m/s, recordings that were sped up are silent, too.
+FASTEST_MPS = 30.0
+# How drivers of the prior follow. On US-101 the acceleration over the next two seconds is 0.39,
+# 0.23 and 0.07 times the speed difference, at gaps of 5, 20 and 55 m.
+#: The response to a speed difference is this by the gap, m/s, and at most that, 1/s.
+CLOSING_GAIN_MPS = 4.5
+LARGEST_CLOSING_GAIN = 0.4
+#: Response to the logarithm of the gap over the wanted one, m/s2.
+HEADWAY_GAIN = 0.1
+#: Response to what a driver is slower than it wishes, 1/s.
+FREE_GAIN = 0.12
+#: They brake as these IDM drivers, with a short headway, where a leader gets close.
+CLOSE_IDM = IdmParameters(
+    headway_s=0.3,
+    comfortable_deceleration=2.0,
+    min_acceleration=-8.0,
+    max_acceleration=1.4,
+)
 
 # The moves.
 #: Samples of an update.
@@ -246,20 +266,19 @@ def _gathered(
     """Samples of all stretches: of scenes several times, of single lanes once.
 
     Passes differ by what is drawn: sides swapped or hidden, lanes widened, moves of the policy. In
-    the last pass the way is lengthened by up to ``config.scale``: the same traffic, but faster.
+    the last pass everybody is faster by up to ``config.faster_mps``.
 
     Args:
         material: with the stretches.
         options: who drives, and what is varied.
-        config: by how much the way is lengthened.
+        config: by how much everybody is faster.
         random: draws what differs.
         times: passes over the scenes.
     """
-    scales = [0.0] * (times - 1) + [config.scale]
     parts = []
-    for scale in scales:
-        scaled = options._replace(scale=scale)
-        parts.append(samples_of(material.around, scaled, random))
+    for faster_mps in [0.0] * (times - 1) + [config.faster_mps]:
+        sped_up = options._replace(faster_mps=faster_mps)
+        parts.append(samples_of(material.around, sped_up, random))
 
     if material.ahead:
         # Cars of one lane have no sides to be hidden, and nothing to be mirrored.
@@ -478,6 +497,41 @@ def prior_drivers(road: Road, scenes: int, random: torch.Generator) -> PriorDriv
     return PriorDrivers(vehicles, lane, speed, aside, headway)
 
 
+def prior_acceleration(vehicles: Vehicles, road: Road, headway: Tensor) -> Tensor:
+    """What drivers of the prior ask for, m/s2, [N, M].
+
+    Behind an equally fast leader they keep the headway that their style shows. They respond to a
+    speed difference as recorded drivers do, the less the larger the gap is in metres: 1.25 s
+    behind a leader at 25 m/s by 0.15 m/s2 per m/s, where IDM does by 0.7. What is dangerous is left
+    to IDM.
+
+    Args:
+        vehicles: fields [N, M].
+        road: that they are on.
+        headway: that a driver keeps, s, [N, M].
+    """
+    view = perceive(vehicles, road)
+    speed = view.speed
+    gap = view.gap.clamp_min(0.5)
+
+    # To the leader's speed, and to the wanted gap.
+    gain = (CLOSING_GAIN_MPS / gap).clamp_max(LARGEST_CLOSING_GAIN)
+    wanted_gap = headway * speed.clamp_min(2.0)
+    for_gap = HEADWAY_GAIN * torch.log(gap / wanted_gap).clamp(-1.0, 1.0)
+    following = gain * view.closing + for_gap
+
+    # To the desired speed, unless a leader is in the way.
+    free = FREE_GAIN * (vehicles.desired_speed - speed)
+    follows = view.ahead.exists[..., SAME]
+    wanted = torch.where(follows, torch.minimum(following, free), free)
+    wanted = wanted.clamp(-2.0, CLOSE_IDM.max_acceleration)
+
+    # A limit on how close one comes; no desired speed holds anybody back here.
+    unlimited = vehicles.with_(desired_speed=torch.full_like(speed, NO_LIMIT_MPS))
+    limit = following_acceleration(scene_of(unlimited, road), CLOSE_IDM)
+    return torch.minimum(wanted, limit)
+
+
 @torch.no_grad()
 def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[Moves, Tensor]:
     """What recordings do not show: moves of IDM drivers, and lane changes into danger.
@@ -494,13 +548,8 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
     vehicles, lane, speed, aside, headway = prior_drivers(road, scenes, random)
     rand, randn = draws(speed.shape, random)
 
-    # What IDM asks for now, m/s2; drivers did that in part so far, or something else.
-    idm = IdmParameters(
-        comfortable_deceleration=2.0,
-        min_acceleration=-8.0,
-        max_acceleration=1.4,
-    )
-    wanted = following_acceleration(scene_of(vehicles, road), with_headways(idm, headway))
+    # What drivers ask for now, m/s2; they did that in part so far, or something else.
+    wanted = prior_acceleration(vehicles, road, headway)
     otherwise = rand() < 0.5
     something_else = 0.6 * randn()
     in_part = (wanted * rand()).clamp(-6.0, 2.0)
@@ -530,7 +579,7 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
     # Recordings are silent at high speed, at a standstill, on a free road and before a collision.
     time_to_collision_s = view.gap / (-view.closing).clamp_min(1e-3)
     headway_now_s = view.gap / speed.clamp_min(1.0)
-    silent = (speed > 19.0) | (speed < 1.5) | (view.gap > 80.0)
+    silent = (speed > FASTEST_MPS) | (speed < 1.5) | (view.gap > 80.0)
     silent |= (time_to_collision_s < 4.0) | (headway_now_s < 0.5)
     # Few overlap.
     overlaps = view.gap < 0.0

@@ -270,13 +270,20 @@ class Segments(NamedTuple):
             lateral_speed=-self.lateral_speed,
         )
 
-    def scaled(self, factor: Tensor) -> Segments:
-        """Lengths along the road times ``factor`` [B, 1]; cars keep theirs, headways stay."""
-        by = factor[:, None]
-        x = self.x * by
-        # The noise is the camera's, and stays as large.
-        noise = self.raw_x - self.x
-        return self._replace(x=x, raw_x=x + noise, speed=self.speed * by)
+    def faster(self, by_mps: Tensor) -> Segments:
+        """Everybody faster by ``by_mps`` [B, 1], m/s; gaps and accelerations stay.
+
+        So recorded drivers seem to respond: to gaps in metres and to differences of speed, at any
+        speed (docs/data_and_generator.md).
+        """
+        frames = torch.arange(self.x.shape[1], device=self.x.device)
+        further = by_mps[:, None] * (PHYSICS_STEP_S * frames[:, None])
+        further = torch.where(self.present, further, 0.0)
+        return self._replace(
+            x=self.x + further,
+            raw_x=self.raw_x + further,
+            speed=torch.where(self.present, self.speed + by_mps[:, None], 0.0),
+        )
 
     def widened(self, factor: Tensor) -> Segments:
         """Lanes and lateral moves times ``factor`` [B, 1]."""
@@ -516,7 +523,7 @@ class Options(NamedTuple):
         estimator: drivers begin where it sees them by nine noisy positions; None: as recorded.
         samples: moves that the policy draws, the nearest of which is made.
         vary: mirror and widen the segments at random.
-        scale: lengthen them by up to this share.
+        faster_mps: everybody in a segment is faster, by up to this much, m/s.
         blind: share of batches without side lanes.
     """
 
@@ -524,7 +531,7 @@ class Options(NamedTuple):
     estimator: Estimator | None = None
     samples: int = 6
     vary: bool = True
-    scale: float = 0.0
+    faster_mps: float = 0.0
     blind: float = 0.25
 
 
@@ -665,7 +672,7 @@ def _estimated(
 
 
 def varied(segments: Segments, options: Options, random: torch.Generator) -> Segments:
-    """The segments mirrored, widened and lengthened at random."""
+    """The segments mirrored, widened and sped up at random."""
     rand, _ = draws((len(segments.x), 1), random)
     if options.vary:
         # All of them or none.
@@ -673,8 +680,8 @@ def varied(segments: Segments, options: Options, random: torch.Generator) -> Seg
             segments = segments.mirrored()
         # From 5 % narrower to 20 % wider.
         segments = segments.widened(0.95 + 0.25 * rand())
-    if options.scale:
-        segments = segments.scaled(1.0 + options.scale * rand())
+    if options.faster_mps:
+        segments = segments.faster(options.faster_mps * rand())
     return segments
 
 

@@ -305,8 +305,8 @@ class HumanConfig(FitConfig):
         sizes: of the policy.
         cutoff_hz: recorded positions along the road are smoothed; of this frequency half is left.
         lateral_cutoff_hz: the same across the road.
-        scale: further copies of the recordings are up to this much longer along the road, so that
-            the same headways are driven at other speeds.
+        faster_mps: in further copies of the recordings everybody is faster, by up to this much,
+            m/s; gaps and accelerations are the same.
         epochs: passes over the samples in cloning.
         rounds: closed-loop rounds after it.
         samples: moves drawn per decision in them, of which the nearest to the recording counts.
@@ -322,7 +322,7 @@ class HumanConfig(FitConfig):
     # what is fitted to
     cutoff_hz: Positive = 0.6
     lateral_cutoff_hz: Positive = 0.4
-    scale: NotNegative = 0.5
+    faster_mps: NotNegative = 15.0
     # cloning
     epochs: Count = 8
     rounds: CountOrZero = 3

@@ -74,3 +74,16 @@ def test_a_car_that_measured_itself_follows_at_the_measured_gap_and_each_leader_
     assert first.driven.tolist() == [True, False]
     assert first.x[:, 1] - first.x[:, 0] == pytest.approx(34.5)
     assert second.x[-1, 2] - second.x[-1, 0] == pytest.approx(24.5)
+
+
+def test_an_echo_of_the_radar_is_no_leader(tmp_path):
+    """A position at which somebody is seen once would be a car that stands."""
+    gap = [30.0] * 400
+    gap[100:103] = [60.0, 80.0, 100.0]
+    path = tmp_path / "instrumented.csv"
+    pl.DataFrame({"drive": 1, "time_s": FRAME / 10, "v": 25.0, "gap": gap}).write_csv(path)
+    first, _ = read_one_lane("I-24", path)
+    # The follower, and its leader before and after.
+    assert first.x.shape[1] == 3
+    seen = first.present[:, 1:].any(1)
+    assert (~seen).sum() == 3

@@ -28,12 +28,18 @@ from ganlane.generator.human import (
     velocity,
     with_choice,
 )
-from ganlane.generator.human_fit import fit_human, fit_steps, prior_samples
+from ganlane.generator.human_fit import (
+    fit_human,
+    fit_steps,
+    prior_acceleration,
+    prior_samples,
+)
 from ganlane.generator.human_samples import (
     LATERAL_GAIN,
     Options,
     cuts,
     samples_of,
+    segments_of,
     smooth_scene,
     target_lanes,
 )
@@ -233,6 +239,45 @@ def test_accidents_the_edge_and_standing_cost():
     assert cost > 3.0
     cost, _ = costs(scene({"speed": 1.0}), ROAD, free[:, :1])
     assert cost > 0.3
+
+
+def test_traffic_that_is_faster_keeps_its_gaps_and_accelerations():
+    recordings = recorded_cars(scenes=1, vehicles=5, seconds=8.0)
+    scenes = [smooth_scene(recording, HumanConfig()) for recording in recordings]
+    segments = segments_of(cuts(scenes, decisions=4, stride=10))
+    faster = segments.faster(torch.full((len(segments.x), 1), 10.0))
+
+    there = segments.present
+    assert faster.speed[there] == pytest.approx(segments.speed[there] + 10.0)
+    assert torch.equal(faster.x[~there], segments.x[~there])
+    # Two vehicles are as far from each other at every time, and the noise is the same.
+    both = there[..., 0] & there[..., 1]
+    before = segments.x[..., 1] - segments.x[..., 0]
+    after = faster.x[..., 1] - faster.x[..., 0]
+    assert after[both] == pytest.approx(before[both], abs=1e-3)
+    assert faster.raw_x - faster.x == pytest.approx(segments.raw_x - segments.x, abs=1e-3)
+    # The way of a second is ten metres longer.
+    second = there[:, :-10] & there[:, 10:]
+    longer = (faster.x - segments.x)[:, 10:] - (faster.x - segments.x)[:, :-10]
+    assert longer[second] == pytest.approx(10.0, abs=1e-2)
+
+
+def follower_asks(gap, speed, leader, desired=40.0, headway=1.5):
+    """What a driver of the prior asks for, m/s2."""
+    cars = scene({"speed": speed}, {"x": gap + 4.5, "speed": leader})
+    cars = cars.with_(desired_speed=torch.full_like(cars.x, desired))
+    return float(prior_acceleration(cars, ROAD, torch.full((1, 2), headway))[0, 0])
+
+
+def test_drivers_of_the_prior_keep_their_headway_and_respond_the_less_the_farther_the_leader():
+    assert follower_asks(45.0, 30.0, 30.0) == pytest.approx(0.0, abs=1e-6)
+    assert follower_asks(60.0, 30.0, 30.0) > 0.0 > follower_asks(30.0, 30.0, 30.0)
+    # 2 m/s slower than the leader: 0.1 times that at 45 m, half as much at twice the gap.
+    assert follower_asks(45.0, 30.0, 32.0) == pytest.approx(0.2, abs=1e-6)
+    assert follower_asks(90.0, 30.0, 32.0, headway=3.0) == pytest.approx(0.1, abs=1e-6)
+    # Nobody speeds up beyond what it wishes, and danger is answered as IDM does.
+    assert follower_asks(60.0, 30.0, 32.0, desired=30.0) == pytest.approx(0.0, abs=1e-6)
+    assert follower_asks(20.0, 30.0, 15.0) < -5.0
 
 
 def test_where_recordings_are_silent_the_prior_brakes_and_keeps_out_of_danger():

@@ -44,14 +44,18 @@ BATCH = 1024
 RATE = 2e-3
 #: Share of drivers with the noise of another sensor besides.
 OTHER_SENSORS = 0.4
-#: Its standard deviation along the road, from the least to the most, m; across it is 0.3 of that.
-OTHER_NOISE_M = (0.003, 0.5)
-#: Its correlation from frame to frame at most.
-OTHER_CORRELATION = 0.95
 #: Drivers are up to this much faster than recorded, m/s.
 FASTER_MPS = 15.0
 #: Errors that weigh alike: speed, both accelerations, both lateral speeds, both places.
 SCALES = (0.3, 0.8, 0.8, 0.1, 0.1, 0.05, 0.05)
+
+# The noise of other sensors.
+#: Its standard deviation along the road, from the least to the most, m.
+OTHER_NOISE_M = (0.003, 0.5)
+#: Across the road it is this share of that.
+OTHER_ACROSS = 0.3
+#: Its correlation from frame to frame at most.
+OTHER_CORRELATION = 0.95
 
 # Units of the observer, along and across, m.
 #: Of the displacements in 0.1 s.
@@ -210,7 +214,9 @@ def fit_estimator(
         positions = smooth[rows] + share * (raw[rows] - smooth[rows])
 
         # On other roads sensors and speeds are others.
-        positions = positions + other_noise(BATCH, random)
+        other = torch.rand((BATCH, 1, 1), generator=random) < OTHER_SENSORS
+        noise = other_noise(BATCH, OBSERVED_POSITIONS, random)
+        positions = positions + torch.where(other, noise, 0.0)
         faster = FASTER_MPS * torch.rand((BATCH, 1), generator=random)
         positions[..., 0] += faster * (PHYSICS_STEP_S * torch.arange(1 - OBSERVED_POSITIONS, 1))
 
@@ -231,24 +237,22 @@ def fit_estimator(
     estimator.requires_grad_(False)
 
 
-def other_noise(rows: int, random: torch.Generator) -> Tensor:
-    """Noise of other sensors, m, [rows, 9, 2]; 0 in all but :data:`OTHER_SENSORS` of the rows.
+def other_noise(tracks: int, frames: int, random: torch.Generator) -> Tensor:
+    """Noise of other sensors on positions, m, [tracks, frames, 2].
 
-    Rows differ in its size, and in how long an error lasts: an autoregression of first order.
+    Tracks differ in its size, and in how long an error lasts: an autoregression of first order.
     """
     low, high = OTHER_NOISE_M
-    size = low * (high / low) ** torch.rand((rows, 1, 1), generator=random)
-    there = torch.rand((rows, 1, 1), generator=random) < OTHER_SENSORS
-    size = torch.where(there, size, 0.0) * torch.tensor([1.0, 0.3])
+    size = low * (high / low) ** torch.rand((tracks, 1, 1), generator=random)
 
-    # Of variance 1 at every frame, whatever its correlation.
-    correlation = OTHER_CORRELATION * torch.rand((rows, 1), generator=random)
+    # Of variance 1 in every frame, whatever the correlation.
+    correlation = OTHER_CORRELATION * torch.rand((tracks, 1), generator=random)
     fresh_share = torch.sqrt(1.0 - correlation * correlation)
-    errors = [torch.randn((rows, 2), generator=random)]
-    while len(errors) < OBSERVED_POSITIONS:
-        fresh = torch.randn((rows, 2), generator=random)
+    errors = [torch.randn((tracks, 2), generator=random)]
+    while len(errors) < frames:
+        fresh = torch.randn((tracks, 2), generator=random)
         errors.append(correlation * errors[-1] + fresh_share * fresh)
-    return size * torch.stack(errors, 1)
+    return size * torch.tensor([1.0, OTHER_ACROSS]) * torch.stack(errors, 1)
 
 
 def noise_shares(

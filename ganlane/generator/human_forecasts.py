@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -41,6 +42,7 @@ from ganlane.generator.human_estimator import (
     Estimator,
     HumanModel,
     error_in,
+    other_noise,
     present_memory,
     random_sides,
     trust,
@@ -64,6 +66,8 @@ CHANGING_MPS = 0.35
 # Of the observer's fit.
 #: Shares of the recorded noise; every scene is used with each of them.
 NOISE_SHARES = (0.0, 0.5, 1.0, 1.2)
+#: And as often with the noise of another sensor in its place.
+OTHER_SENSORS = 2
 #: Frames between the starts of two windows.
 OBSERVER_STRIDE = 2
 #: Windows of an update.
@@ -243,8 +247,8 @@ def _seen_besides(model: HumanModel, segments: Segments, mean: Tensor) -> Tensor
 def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanConfig) -> None:
     """Fit the observer of ``model`` to what its policy misses in these scenes.
 
-    Every scene counts with none, half, all and more of its noise, so that the observer adds nothing
-    where a recording has none.
+    Every scene counts with none, half, all and more of its noise, and with that of other sensors,
+    so that the observer adds nothing where nothing can be known of a recording's errors.
 
     Args:
         model: one of :func:`ganlane.generator.human_fit.fit_human`; it is changed in place.
@@ -263,13 +267,22 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
     for parameter in model.observer.layers[-1].parameters():
         nn.init.zeros_(parameter)
 
-    # The noise is what smoothing takes away.
-    smoothed = [smooth_scene(scene, config) for scene in scenes]
+    # The recorded noise is what smoothing takes away.
     noisy = []
-    for share in NOISE_SHARES:
-        for scene, smooth in zip(scenes, smoothed):
-            x = smooth.x + share * (scene.x - smooth.x)
-            y = smooth.y + share * (scene.y - smooth.y)
+    for scene in scenes:
+        smooth = smooth_scene(scene, config)
+        recorded = np.stack((scene.x - smooth.x, scene.y - smooth.y), -1)
+        noises = [share * recorded for share in NOISE_SHARES]
+
+        # Another sensor's, of those who are there: [T, V, 2].
+        frames, vehicles = scene.present.shape
+        for _ in range(OTHER_SENSORS):
+            other = other_noise(vehicles, frames, random).transpose(0, 1)
+            noises.append(other.double().numpy() * scene.present[..., None])
+
+        for noise in noises:
+            x = smooth.x + noise[..., 0]
+            y = smooth.y + noise[..., 1]
             noisy.append(replace(scene, x=x, y=y))
 
     # Windows [W, 9 + 8 + 8, 2]: observed positions, the recorded next ones, and the forecast.

@@ -24,6 +24,7 @@ from ganlane.generator.human import (
     ALONG,
     SAME,
     HumanPolicy,
+    LaneChoice,
     Memory,
     Situation,
     cars,
@@ -101,13 +102,15 @@ LANE_RATE = 3e-3
 #: Decay of the weights.
 LANE_DECAY = 0.05
 
-#: How much more strongly the policy is pulled to what it is in the second fine-tuning.
+#: How often the level of lane changes is set, with a fine-tuning after it.
+SETTLINGS = 2
+#: How much more strongly the policy is pulled to what it is in these.
 SETTLING_TIMES = 2.0
 
 
 def fit_steps(config: HumanConfig) -> int:
-    """Steps of a fit: cloning, rounds in closed loop, and the iterations of both fine-tunings."""
-    return 1 + config.rounds + config.tuning + config.settling
+    """Steps of a fit: cloning, rounds in closed loop, and the iterations of all fine-tunings."""
+    return 1 + config.rounds + config.tuning + SETTLINGS * config.settling
 
 
 class Material(NamedTuple):
@@ -202,12 +205,13 @@ def fit_human(
         close_the_loop(model, material, teacher, config, random, report)
 
         # Accidents cost; the pull keeps the rest as it is.
-        tune(policy, choices, danger, config.tuning, config.pull, random, report)
-        match_rate(policy, choices)
+        driven = tune(policy, choices, danger, config.tuning, config.pull, random, report)
 
         # More lane changes bring new accidents: it learns to do without them at this level.
         pull = SETTLING_TIMES * config.pull
-        tune(policy, None, danger, config.settling, pull, random, report)
+        for _ in range(SETTLINGS):
+            match_rate(policy, choices, driven)
+            driven = tune(policy, None, danger, config.settling, pull, random, report)
         return model.eval().requires_grad_(False)
 
 
@@ -399,20 +403,25 @@ def train_lane_choice(
 
 
 @torch.no_grad()
-def match_rate(policy: HumanPolicy, choices: Choices) -> None:
-    """Let lane changes begin as often as recorded ones did, over the recorded states.
+def match_rate(policy: HumanPolicy, choices: Choices, driven: LaneChoice | None = None) -> None:
+    """Let lane changes begin as often as recorded ones did.
 
-    Where recorded drivers took gaps that count as danger here, no change begins; others make up for
-    it. Only the level is moved: the bias of all beginnings.
+    That is over the recorded states and over driven ones, which count as much: where recorded
+    drivers took gaps that count as danger here, no change begins, and others make up for it. Only
+    the level is moved: the bias of all beginnings.
 
     Args:
         policy: it is changed in place.
         choices: recorded ones.
+        driven: those of drivers in their lanes in a simulation (:func:`tune`), [K]; None: there are
+            none yet.
     """
     wanted = begins_per_decision(choices)
     _, bias = policy.lane[-1].parameters()
-    choice = choices.keeping(slice(None))
     unmoved = bias[0].clone()
+    of_states = [choices.keeping(slice(None))]
+    if driven is not None:
+        of_states.append(driven)
 
     # Bisection: the rate grows with the bias, which moves by -6 to 6.
     low = -6.0
@@ -420,8 +429,8 @@ def match_rate(policy: HumanPolicy, choices: Choices) -> None:
     for _ in range(20):
         middle = 0.5 * (low + high)
         bias[0] = unmoved + middle
-        begins = policy.lane_chances(choice)[:, 1:].sum(-1)
-        if float(begins.mean()) < wanted:
+        rates = [policy.lane_chances(choice)[:, 1:].sum(-1).mean() for choice in of_states]
+        if float(sum(rates)) / len(rates) < wanted:
             low = middle
         else:
             high = middle

@@ -41,6 +41,7 @@ from ganlane.generator.human_estimator import (
     DIFFERENCE_SCALE,
     Estimator,
     HumanModel,
+    Observer,
     error_in,
     other_noise,
     present_memory,
@@ -66,7 +67,7 @@ CHANGING_MPS = 0.35
 # Of the observer's fit.
 #: Shares of the recorded noise; every scene is used with each of them.
 NOISE_SHARES = (0.0, 0.5, 1.0, 1.2)
-#: And as often with the noise of another sensor in its place.
+#: And so often with the noise of another sensor in its place.
 OTHER_SENSORS = 2
 #: Frames between the starts of two windows.
 OBSERVER_STRIDE = 2
@@ -247,58 +248,87 @@ def _seen_besides(model: HumanModel, segments: Segments, mean: Tensor) -> Tensor
 def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanConfig) -> None:
     """Fit the observer of ``model`` to what its policy misses in these scenes.
 
-    Every scene counts with none, half, all and more of its noise, and with that of other sensors,
-    so that the observer adds nothing where nothing can be known of a recording's errors.
+    First they have none, half, all and more of their noise, so that the observer adds nothing where
+    a recording has none. Then they also have that of other sensors, whose next errors can hardly be
+    known. With both from the start it predicts the recorded noise worse.
 
     Args:
         model: one of :func:`ganlane.generator.human_fit.fit_human`; it is changed in place.
         scenes: recordings of several lanes, as those of the policy's fit.
-        config: seed, smoothing, and how many updates there are (``observing``).
+        config: seed, smoothing, and how many updates there are (``observing``) in both parts.
     """
     random = torch.Generator().manual_seed(config.seed)
+    observer = model.observer.requires_grad_(True)
+    # The forecasts that it corrects are without it: it begins with differences of 0.
+    for parameter in observer.layers[-1].parameters():
+        nn.init.zeros_(parameter)
 
     def recorded_and_driven(segments: Segments) -> Tensor:
         """Positions [1, B, 9 + 8 + 8, V, 2]: the recorded ones, then those of the mean driver."""
         mean = _driven(model, 0, random, segments)
         return torch.cat((segments.positions[None], mean), 2)
 
-    # The forecasts that it corrects are without it: it begins with differences of 0.
-    model.observer.requires_grad_(True)
-    for parameter in model.observer.layers[-1].parameters():
-        nn.init.zeros_(parameter)
+    # Windows [W, 9 + 8 + 8, 2]: observed positions, the recorded next ones, and the forecast.
+    parts = []
+    for noisy in noisy_scenes(scenes, config, random):
+        (windows,) = driven_windows(
+            recorded_and_driven,
+            noisy,
+            PREDICTED_STEPS,
+            OBSERVER_STRIDE,
+        )
+        parts.append(torch.from_numpy(windows).float())
 
-    # The recorded noise is what smoothing takes away.
-    noisy = []
+    recorded, other = parts
+    _fit_to_windows(observer, recorded, config.observing, random)
+    _fit_to_windows(observer, torch.cat((recorded, other)), config.observing, random)
+    observer.requires_grad_(False)
+
+
+def noisy_scenes(
+    scenes: Sequence[Recording],
+    config: HumanConfig,
+    random: torch.Generator,
+) -> tuple[list[Recording], list[Recording]]:
+    """The scenes smoothed, with shares of their own noise, and with that of other sensors."""
+    recorded = []
+    other = []
     for scene in scenes:
         smooth = smooth_scene(scene, config)
-        recorded = np.stack((scene.x - smooth.x, scene.y - smooth.y), -1)
-        noises = [share * recorded for share in NOISE_SHARES]
+        exact = replace(scene, x=smooth.x, y=smooth.y)
 
-        # Another sensor's, of those who are there: [T, V, 2].
+        # What smoothing takes away.
+        noise = np.stack((scene.x - smooth.x, scene.y - smooth.y), -1)
+        for share in NOISE_SHARES:
+            recorded.append(_with_noise(exact, share * noise))
+
         frames, vehicles = scene.present.shape
         for _ in range(OTHER_SENSORS):
-            other = other_noise(vehicles, frames, random).transpose(0, 1)
-            noises.append(other.double().numpy() * scene.present[..., None])
+            noise = other_noise(vehicles, frames, random).transpose(0, 1).double().numpy()
+            other.append(_with_noise(exact, noise))
+    return recorded, other
 
-        for noise in noises:
-            x = smooth.x + noise[..., 0]
-            y = smooth.y + noise[..., 1]
-            noisy.append(replace(scene, x=x, y=y))
 
-    # Windows [W, 9 + 8 + 8, 2]: observed positions, the recorded next ones, and the forecast.
-    (windows,) = driven_windows(
-        recorded_and_driven,
-        noisy,
-        PREDICTED_STEPS,
-        OBSERVER_STRIDE,
-    )
+def _with_noise(scene: Recording, noise: np.ndarray) -> Recording:
+    """The scene with ``noise`` [T, V, 2] on the positions of those who are there, m."""
+    there = scene.present
+    return replace(scene, x=scene.x + there * noise[..., 0], y=scene.y + there * noise[..., 1])
+
+
+def _fit_to_windows(
+    observer: Observer,
+    windows: Tensor,
+    updates: int,
+    random: torch.Generator,
+) -> None:
+    """Fit the observer to windows [W, 9 + 8 + 8, 2], as in :func:`fit_observer`."""
     parts = (OBSERVED_POSITIONS, PREDICTED_STEPS, PREDICTED_STEPS)
-    positions, wanted, forecast = torch.from_numpy(windows).float().split(parts, 1)
+    positions, wanted, forecast = windows.split(parts, 1)
 
     # What is learnt is the recorded position less the forecast one.
-    optimizer = torch.optim.AdamW(model.observer.parameters(), OBSERVER_RATE, weight_decay=1e-2)
-    for update in range(config.observing):
-        optimizer.param_groups[0]["lr"] = OBSERVER_RATE * half_cosine(update, config.observing)
+    optimizer = torch.optim.AdamW(observer.parameters(), OBSERVER_RATE, weight_decay=1e-2)
+    for update in range(updates):
+        optimizer.param_groups[0]["lr"] = OBSERVER_RATE * half_cosine(update, updates)
         rows = torch.randint(len(wanted), (OBSERVER_BATCH,), generator=random)
 
         # Left and right swapped in half of the rows; x stays: factors [B, 1, 2].
@@ -308,6 +338,5 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
         ahead = mirror * forecast[rows]
         missed = mirror * wanted[rows] - ahead
 
-        difference = model.observer(seen, ahead) - missed
+        difference = observer(seen, ahead) - missed
         descend(optimizer, error_in(difference, DIFFERENCE_SCALE))
-    model.observer.requires_grad_(False)

@@ -217,7 +217,7 @@ def tune(
     pull: float,
     random: torch.Generator,
     report: Report,
-) -> None:
+) -> LaneChoice | None:
     """Fine-tune ``policy`` in place; the mean cost of a decision in each iteration is reported.
 
     Args:
@@ -228,7 +228,11 @@ def tune(
         pull: weight of the divergence from what it is now.
         random: draws scenes, moves and batches.
         report: called with the cost after every iteration.
+
+    Returns:
+        The lane choices [K] that drivers in their lanes had in the last iteration, if any.
     """
+    driven = None
     reference = deepcopy(policy).requires_grad_(False)
 
     # The critic sees what both of the policy's networks see. It is of no use afterwards.
@@ -258,6 +262,7 @@ def tune(
         # Those that count, one below the other: [R, ...].
         counts = decisions.valid
         flat = decisions.rows(counts)
+        driven = flat.rows(flat.keeping).choice
         wanted = wanted[counts]
         advantage = advantage[counts]
         # In units of their own spread, so that the step does not depend on the costs' scale.
@@ -286,6 +291,7 @@ def tune(
                 descend(optimizer, loss, 1.0)
 
         report(float(decisions.cost.sum()) / float(counts.sum()))
+    return driven
 
 
 def begins_per_decision(teacher: Choices) -> float:

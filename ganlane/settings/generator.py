@@ -313,8 +313,9 @@ class HumanConfig(FitConfig):
         learning_rate: of Adam in cloning.
         tuning: iterations of the fine-tuning; 0: none.
         pull: weight of the divergence from the cloned policy in it.
-        settling: iterations of a second fine-tuning, once lane changes are as frequent as recorded.
-        observing: updates of the observer, which adds a camera's errors to forecasts.
+        settling: iterations of two more, each after lane changes were made as frequent as recorded.
+        observing: updates of the observer, which adds a camera's errors to forecasts: so many to
+            the recorded ones, and again with those of other sensors.
     """
 
     preset: str = field(default="human", kw_only=True)

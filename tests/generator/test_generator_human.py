@@ -309,9 +309,9 @@ def test_a_fit_is_the_same_for_the_same_seed_and_reports_its_steps(small_fits):
     first = fit_human(config, recordings, report=costs_of_steps.append)
     second = fit_human(config, recordings)
     assert torch.equal(torch.get_rng_state(), state)
-    assert len(costs_of_steps) == fit_steps(config) == 4
+    assert len(costs_of_steps) == fit_steps(config) == 5
     # Fine-tuning alone has a cost.
-    assert [cost is None for cost in costs_of_steps] == [True, True, False, False]
+    assert [cost is None for cost in costs_of_steps] == [True, True, False, False, False]
     for one, other in zip(first.state_dict().values(), second.state_dict().values()):
         assert torch.equal(one, other)
     assert all(tensor.isfinite().all() for tensor in first.state_dict().values())

@@ -2,6 +2,7 @@
 
     python -m benchmarks.human_fits card RUN/generator_human.safetensors ...
     python -m benchmarks.human_fits sites RUN/generator_human.safetensors
+    python -m benchmarks.human_fits responses
 
 ``card``: how close they come to recorded driving. Each file drives the scenes that were held out of
 its fit (``ganlane train_generator generator=human 'data.held_out=[us101-a]'``), beside
@@ -12,6 +13,9 @@ scenes. The table is of all these scenes together, the intervals are over scenes
 a GANLANE_DATA that holds ``ngsim/us101_scenes.csv`` alone). Mean errors over 0.8 s and root mean
 square errors at 5 s, over those of constant velocity, of the driven cars in the first 400 segments
 of each file; beside it the shipped ``gan_calibrated``, and IDM with each driver's own headway.
+
+``responses``: how strongly recorded followers respond to a speed difference, by their gap: the
+slope of their mean acceleration over the next two seconds, 1/s.
 """
 
 from __future__ import annotations
@@ -20,14 +24,17 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from benchmarks.script import make_parser, markdown, run_script
 from ganlane.commands.realism import drive_from_starts, factories_on_card, scenes_path
 from ganlane.config.run import call_settings
-from ganlane.data import default_scenes
+from ganlane.data import default_scenes, read_scenes
+from ganlane.data.dense import recordings_of
 from ganlane.data.one_lane import one_lane_files, read_one_lane
 from ganlane.evaluation.table import Table, with_interval
 from ganlane.generator import load_generator, shipped_generator
@@ -40,17 +47,24 @@ from ganlane.generator.forecasts import (
     driven_windows,
     long_errors,
 )
+from ganlane.generator.human import perceive
 from ganlane.generator.human_forecasts import human_driver
+from ganlane.generator.human_samples import HISTORY, batches, cuts, recorded, smooth_scene
 from ganlane.generator.windows import OBSERVED_POSITIONS, PREDICTED_STEPS, cut_windows
+from ganlane.keys import PHYSICS_STEP_S
 from ganlane.realism.card import card_rows
 from ganlane.realism.measures import RESAMPLES, Measured
 from ganlane.realism.sheets import quantities_table
 from ganlane.realism.starts import Starts
-from ganlane.settings.generator import CalibratedConfig
+from ganlane.settings.generator import CalibratedConfig, HumanConfig
 from ganlane.settings.recordings import RealismConfig
 from ganlane.weights import load_weights
 
 SEGMENTS = 400
+#: Bounds of the gaps in ``responses``, m.
+GAPS_M = (2, 8, 15, 25, 40, 70, 120)
+#: The two seconds after a decision, in frames.
+AFTER = 20
 #: Steps of the forecasts, and frames between the starts of two windows.
 HORIZONS = ((PREDICTED_STEPS, 10), (LONG_STEPS, 25))
 
@@ -88,6 +102,34 @@ def sites(weights: Path) -> str:
     return markdown(Table("", headings, lines))
 
 
+def responses() -> str:
+    """A line for each file."""
+    files = {"US-101": recordings_of(read_scenes(default_scenes()))}
+    for name, path in one_lane_files(default_scenes()).items():
+        files[name] = read_one_lane(name, path)[:SEGMENTS]
+    lines = []
+    for name, recordings in files.items():
+        scenes = [smooth_scene(recording, HumanConfig()) for recording in recordings]
+        gaps, closing, accelerations = [], [], []
+        for segments in batches(cuts(scenes, decisions=4, stride=AFTER)):
+            vehicles, _ = recorded(segments, 0, segments.length)
+            view = perceive(vehicles, segments.road)
+            later = segments.speed[:, HISTORY + AFTER]
+            who = vehicles.valid & segments.driven & segments.present[:, HISTORY + AFTER]
+            gaps.append(view.gap[who])
+            closing.append(view.closing[who])
+            accelerations.append((later - view.speed)[who] / (AFTER * PHYSICS_STEP_S))
+        gap, seen, done = (torch.cat(parts).numpy() for parts in (gaps, closing, accelerations))
+        slopes = []
+        for low, high in pairwise(GAPS_M):
+            among = (gap >= low) & (gap < high) & (np.abs(seen) < 6.0)
+            slope = np.polyfit(seen[among], done[among], 1)[0] if among.sum() > 100 else np.nan
+            slopes.append(f"{slope:.2f}")
+        lines.append([name, *slopes])
+    headings = [f"{low} to {high} m" for low, high in pairwise(GAPS_M)]
+    return markdown(Table("", ["file", *headings], lines))
+
+
 def driven_by(file: Path) -> Starts:
     """The fit and its rivals in the scenes that it never saw."""
     held_out = load_weights(file, "generator")[1]["data"]["held_out"]
@@ -122,7 +164,9 @@ def card(weights: Sequence[Path]) -> str:
 
 
 def judged(options: argparse.Namespace) -> str:
-    """One of the two."""
+    """One of the three."""
+    if options.action == "responses":
+        return responses()
     if options.action == "card":
         return card(options.weights)
     return "\n\n".join(map(sites, options.weights))
@@ -130,6 +174,6 @@ def judged(options: argparse.Namespace) -> str:
 
 if __name__ == "__main__":
     parser = make_parser(__doc__)
-    parser.add_argument("action", choices=("card", "sites"))
-    parser.add_argument("weights", nargs="+", type=Path)
+    parser.add_argument("action", choices=("card", "sites", "responses"))
+    parser.add_argument("weights", nargs="*", type=Path)
     sys.exit(run_script(judged, parser.parse_args()))

@@ -274,7 +274,7 @@ class Segments(NamedTuple):
         """Everybody faster by ``by_mps`` [B, 1], m/s; gaps and accelerations stay.
 
         So recorded drivers seem to respond: to gaps in metres and to differences of speed, at any
-        speed (docs/data_and_generator.md).
+        speed (docs/generators.md).
         """
         frames = torch.arange(self.x.shape[1], device=self.x.device)
         further = by_mps[:, None] * (PHYSICS_STEP_S * frames[:, None])

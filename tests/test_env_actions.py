@@ -66,7 +66,7 @@ def test_the_speed_aimed_at_is_the_last_number_of_the_observation():
     env = ganlane.make_env(actions="lane_speed", seed=1)
     td = env.reset()
     assert td["observation"][0, -1] == 1.0
-    td = env.step(td.set("action", torch.tensor([SLOWER])))["next"]
+    td = step(env, td, SLOWER)
     assert td["observation"][0, -1].item() == pytest.approx(0.9)
     assert td["observation"].shape[1] == observation_size("lane_view_overlap", 9) + 1
 

@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 from reference.refusals import user_error
-from reference.worlds import same_bits
+from reference.worlds import same_bits, step
 from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import ExcludeTransform, ParallelEnv, RemoveEmptySpecs, SerialEnv
 from torchrl.envs.utils import check_env_specs
@@ -22,8 +22,7 @@ KEEP = torch.zeros(2, dtype=torch.int64)
 
 def decided(env, **state):
     """The state after a first decision to keep the lane."""
-    td = env.reset().update({keys.ACTION: KEEP, **state})
-    return env.step(td)["next"]
+    return step(env, env.reset().update(state))
 
 
 # Several environments in one

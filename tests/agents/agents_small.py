@@ -20,12 +20,12 @@ def saved_in(folder: Path, **more) -> Path:
     return path
 
 
-def transitions(size, rows=64, seed=0, scale=1.0, most_steps=1):
+def transitions(size, rows=64, scale=1.0, most_steps=1):
     """``rows`` transitions with observations of ``size`` numbers; one of five or so is terminal.
 
     Rewards have a standard deviation of ``scale``; a transition is of 1 to ``most_steps`` steps.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
 
     def normal(columns):
         return torch.randn(rows, columns, generator=generator)

@@ -10,18 +10,15 @@ from ganlane.agents import RainbowConfig
 from ganlane.agents.replay import make_replay
 
 
-def config(capacity=256, **options):
-    return RainbowConfig(capacity=capacity, batch_size=128, warmup=128, **options)
-
-
 def buffer(rows=200, seed=0, **options):
-    result = make_replay(config(**options), torch.Generator().manual_seed(seed))
+    config = RainbowConfig(capacity=256, batch_size=128, warmup=128, **options)
+    result = make_replay(config, torch.Generator().manual_seed(seed))
     result.extend(transitions(1, rows))
     return result
 
 
-def counts(replay, draws=400):
-    drawn = torch.cat([replay.sample()["index"] for _ in range(draws)])
+def counts(replay):
+    drawn = torch.cat([replay.sample()["index"] for _ in range(400)])
     return torch.bincount(drawn, minlength=200).numpy()
 
 

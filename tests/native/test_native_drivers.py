@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from reference.kernels import MIXED, RUNNABLE, apart, kernel_of
-from reference.worlds import environment, leaves, random_environment, same_bits
+from reference.worlds import environment, leaves, random_environment, run, same_bits, step
 
 from ganlane import keys
 from ganlane.api import make_env
@@ -145,9 +145,7 @@ def test_drivers_make_room_on_a_ramp(traffic):
     for courtesy in (2.0, 0.0):
         options = {"kernel": "torch", "mobil": {"courtesy": courtesy}}
         env = make_env(traffic, num_envs=4, env="on_ramp", **options).base_env
-        td = env.reset()
-        for _ in range(18):
-            td = env.step(td.set("action", torch.zeros(4, dtype=torch.int64)))["next"]
+        *_, td = run(env, 18)
         places.append(td[keys.VEHICLES, "x"])
     assert (places[0] != places[1]).any()
 
@@ -261,7 +259,7 @@ def test_a_row_that_ends_leaves_its_drivers_memory_alone():
     env = make_env("gan", num_envs=3, kernel="native")
     td = env.reset()
     off_road = td[keys.VEHICLES, "target_lane"][:, 0] == 0
-    after = env.step(td.set("action", torch.where(off_road, keys.RIGHT, keys.KEEP)))["next"]
+    after = step(env, td, torch.where(off_road, keys.RIGHT, keys.KEEP))
     for row, ends in enumerate(off_road.tolist()):
         assert ends == (same_bits(after[keys.TRAFFIC][row], td[keys.TRAFFIC][row]) == [])
     assert off_road.any()

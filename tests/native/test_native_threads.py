@@ -17,11 +17,11 @@ ROWS = 3 * ROWS_PER_THREAD + BLOCK + 1
 DECISIONS = 30
 
 
-def course(threads, seed=0, rows=ROWS):
+def course(threads, seed=0):
     """Observations and rewards of all rows, by a number of threads."""
-    batch = make_rows("idm_mobil", rows, False, (), {})
-    batch.start(seed, np.arange(rows))
-    actions = np.random.default_rng(seed).integers(3, size=(DECISIONS, rows))
+    batch = make_rows("idm_mobil", ROWS, False, (), {})
+    batch.start(seed, np.arange(ROWS))
+    actions = np.random.default_rng(seed).integers(3, size=(DECISIONS, ROWS))
 
     def driven():
         kernel_threads.set(threads)

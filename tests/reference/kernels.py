@@ -26,11 +26,11 @@ MIXED = {
 }
 
 
-def kernel_of(env: HighwayEnv, variant: str | None = None) -> Kernel:
+def kernel_of(env: HighwayEnv) -> Kernel:
     """The kernel for the environment's road, rules, traffic and actions."""
     drivers = env.traffic.native_drivers()
     rules = env.road, env.vehicles, env.episode, env.ego
-    return Kernel(*rules, drivers, variant, env.actions, env.rules.mobil)
+    return Kernel(*rules, drivers, actions=env.actions, mobil=env.rules.mobil)
 
 
 def apart(

@@ -8,7 +8,7 @@ pytest.importorskip(
 )
 
 from reference.traffics import start
-from reference.worlds import episode_keys, scalar_cars
+from reference.worlds import episode_keys, scalar_cars, step
 from reference.worlds import vehicles as scene_of
 
 from ganlane import keys
@@ -17,8 +17,6 @@ from ganlane.settings.driving import Visibility
 from ganlane.sim.random import Purpose, uniform
 from ganlane.sim.state import Vehicles
 from ganlane_simulators import HighwayEnvTraffic
-
-KEEP = torch.zeros(1, dtype=torch.int64)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +37,7 @@ def test_a_step_is_that_of_highway_envs_own_road(traffic):
     before = Vehicles.of(state[keys.VEHICLES])
     seen = []
     env.recorder = lambda vehicles, running: seen.append(vehicles)
-    env.step(state.set(keys.ACTION, KEEP))
+    step(env, state)
 
     # Drivers' exponents, in HighwayEnv's range.
     key = episode_keys([2], traffic.stream)
@@ -70,10 +68,8 @@ def test_a_step_is_that_of_highway_envs_own_road(traffic):
 
 def test_a_state_can_be_branched(traffic):
     env = HighwayEnv(traffic, 1)
-    state = env.step(start(env, [0]).set(keys.ACTION, KEEP))["next"].clone()
-    first, second = (
-        env.step(state.clone().set(keys.ACTION, KEEP))["next", keys.VEHICLES] for _ in range(2)
-    )
+    state = step(env, start(env, [0]))
+    first, second = (step(env, state)[keys.VEHICLES] for _ in range(2))
     assert (first == second).all()
 
 
@@ -87,9 +83,9 @@ def two(x_ego, ego=None, slow=None):
     return scene_of(*cars, dtype=torch.float32)
 
 
-def moved(traffic, scene, timer=0.0):
+def moved(traffic, scene):
     key = torch.zeros(1, dtype=torch.int64)
-    return traffic.move(scene, {"timer": torch.full_like(scene.x, timer)}, key, key)[0]
+    return traffic.move(scene, {"timer": torch.zeros_like(scene.x)}, key, key)[0]
 
 
 def test_a_follower_brakes_for_an_ego_that_stands_in_its_lane(traffic):

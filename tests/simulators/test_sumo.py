@@ -7,6 +7,7 @@ from reference.refusals import user_error
 pytest.importorskip("libsumo", reason="SUMO is not installed: pip install 'ganlane[sumo]'")
 
 from reference.traffics import drive, start
+from reference.worlds import step
 
 from ganlane import keys
 from ganlane.agents.drivers import DRIVERS
@@ -18,7 +19,6 @@ from ganlane.sim.state import Road, body_lanes
 from ganlane_simulators import SumoTraffic
 
 LEFT = 1
-KEEP = torch.zeros(1, dtype=torch.int64)
 
 
 @pytest.fixture(scope="module")
@@ -79,21 +79,21 @@ def test_vehicles_that_return_in_front_of_the_ego_are_followed(traffic):
 
 def test_a_state_that_sumo_did_not_leave_is_refused(traffic):
     env = HighwayEnv(traffic, 1)
-    first = env.step(start(env, [0]).set(keys.ACTION, KEEP))["next"].clone().set(keys.ACTION, KEEP)
-    second = env.step(first.clone())["next"].clone()
-    env.step(second.set(keys.ACTION, KEEP))
+    first = step(env, start(env, [0]))
+    second = step(env, first)
+    step(env, second)
     with user_error("not the one that SUMO left"):
-        env.step(first)
+        step(env, first)
 
 
 def test_two_environments_cannot_take_turns_but_may_follow_each_other():
     one = HighwayEnv(SumoTraffic(), 1)
     other = HighwayEnv(SumoTraffic(), 1)
-    first = one.step(start(one, [0]).set(keys.ACTION, KEEP))["next"]
-    other.step(start(other, [0]).set(keys.ACTION, KEEP))
+    first = step(one, start(one, [0]))
+    step(other, start(other, [0]))
     with user_error("a process has one SUMO"):
-        one.step(first.set(keys.ACTION, KEEP))
-    one.step(start(one, [0]).set(keys.ACTION, KEEP))
+        step(one, first)
+    step(one, start(one, [0]))
 
 
 def test_episodes_that_take_the_rows_of_others_are_evaluated_as_in_a_batch_of_their_own(traffic):

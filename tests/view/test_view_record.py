@@ -10,6 +10,7 @@ import pytest
 import torch
 from reference.refusals import user_error
 from reference.synthetic import synthetic_scenes
+from reference.worlds import step
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
 from view_scenes import straight
@@ -45,7 +46,7 @@ def test_the_recording_has_a_frame_per_physics_step():
     state = env.reset(env.reset().update({"seed": torch.tensor([4]), "episode": torch.tensor([7])}))
     assert trajectory.x[0] == pytest.approx(state["vehicles", "x"][0].numpy())
     while not state["done"].any():
-        state = env.step_mdp(env.step(state.set("action", torch.tensor([0]))))
+        state = step(env, state)
     assert trajectory.x[-1] == pytest.approx(state["vehicles", "x"][0].numpy())
     assert len(trajectory) == int(state["step"]) + 1
     assert trajectory.time_s[-1] == pytest.approx(0.1 * int(state["step"]))

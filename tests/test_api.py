@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 import torch
 from reference.processes import python_blocks
-from reference.refusals import last_path, user_error
+from reference.refusals import last_path, results_in, user_error
 
 import ganlane
 from ganlane.__main__ import main
@@ -72,8 +72,8 @@ def test_a_loaded_agent_drives_an_environment():
 def test_the_table_has_the_numbers_of_the_command(capsys):
     line = "agents=[mobil,random_legal] traffics=[idm,idm_mobil] episodes=3 env.goal_m=40 seed=2"
     assert main(["evaluate", *line.split()]) == 0
-    written = last_path(capsys.readouterr().out)
-    rows = json.loads(written.read_text())["rows"]
+    folder = last_path(capsys.readouterr().out).parent
+    rows = results_in(folder)["rows"]
     threads = torch.get_num_threads()
     agents, traffics = ["mobil", "random_legal"], ["idm", "idm_mobil"]
     table = ganlane.api.evaluate(agents, traffics, 3, seed=2, goal_m=40)
@@ -81,8 +81,8 @@ def test_the_table_has_the_numbers_of_the_command(capsys):
     assert json.loads(json.dumps(table.to_dicts())) == rows
     assert table["episodes"].to_list() == [3] * 4
     assert table["normalized_percent"][0] == pytest.approx(100.0)
-    assert (written.parent / "config.yaml").is_file()
-    assert pl.read_parquet(written.parent / "episodes.parquet").height == 12
+    assert (folder / "config.yaml").is_file()
+    assert pl.read_parquet(folder / "episodes.parquet").height == 12
 
 
 def test_own_drivers_and_own_names_stand_in_the_table():

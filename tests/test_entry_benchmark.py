@@ -9,7 +9,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 from reference.processes import ROOT
-from reference.refusals import user_error
+from reference.refusals import results_in, user_error
 
 import ganlane
 from ganlane.agents.checkpoint import agent_file
@@ -39,7 +39,7 @@ def cells_driven(monkeypatch):
 
 
 def results():
-    return json.loads(Path("out/results.json").read_text())
+    return results_in(Path("out"))
 
 
 def entries(told):

@@ -1,10 +1,9 @@
 """``ganlane evaluate`` from end to end, with tiny budgets, in process."""
 
-import json
 from functools import partial
 
 import pytest
-from reference.refusals import last_path
+from reference.refusals import last_path, results_in
 
 from ganlane.config.run import run_command
 
@@ -15,15 +14,14 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 def run(capsys, *arguments):
-    """Path and content of the results."""
+    """The rows of the results."""
     assert main([*SHORT, *arguments]) == 0
-    path = last_path(capsys.readouterr().out)
-    return path, json.loads(path.read_text())
+    return results_in(last_path(capsys.readouterr().out).parent)["rows"]
 
 
 def test_a_users_traffic_and_policy_stand_in_the_table(capsys):
     agents = "agents=[entry_own_parts.Stubborn,keep_lane]"
-    rows = run(capsys, agents, "traffics=[entry_own_parts.Cruise]")[1]["rows"]
+    rows = run(capsys, agents, "traffics=[entry_own_parts.Cruise]")
     assert [row["agent"] for row in rows] == ["entry_own_parts.Stubborn", "keep_lane"]
     assert rows[0]["mean_reward"] == rows[1]["mean_reward"]
     assert rows[0]["traffic"] == "entry_own_parts.Cruise"

@@ -1,11 +1,10 @@
 """``ganlane record`` writes datasets that minari loads, and that can be driven again."""
 
-import json
 import sys
 
 import numpy as np
 import pytest
-from reference.refusals import refusal
+from reference.refusals import refusal, results_in
 
 import ganlane
 from ganlane.__main__ import main
@@ -64,7 +63,7 @@ def test_the_call_from_python_names_the_dataset_and_says_how_the_episodes_ended(
     assert done.results["dataset"] == name
     assert done.results["episodes"] == sum(done.results["ends"].values()) == 3
     assert done.results["decisions"] == minari.load_dataset(name).total_steps
-    assert json.loads((done.folder / "results.json").read_text())["seeds"]["stream"] == "train"
+    assert results_in(done.folder)["seeds"]["stream"] == "train"
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,12 @@
 """Every run of a sweep has a folder of its own, whichever launcher starts it."""
 
-import json
 import logging
 from pathlib import Path
 
 import entry_tiny
 import pytest
 from reference.processes import run
-from reference.refusals import is_one_sentence
+from reference.refusals import is_one_sentence, results_in
 
 from ganlane.__main__ import main
 
@@ -38,7 +37,7 @@ def test_the_runs_of_a_sweep_share_no_file(launcher, tmp_path):
     ]
     assert files[0] == files[1]
     assert files[0] >= {"checkpoints/last.pt", "config.yaml", "metrics.csv"}
-    results = [json.loads((run / "results.json").read_text()) for run in runs]
+    results = map(results_in, runs)
     told = [(result["config"]["seed"], result["decisions"]) for result in results]
     assert told == [(0, 320), (1, 320)]
     first, second = ((run / "agent.safetensors").read_bytes() for run in runs)
@@ -56,7 +55,7 @@ def test_a_sweep_of_evaluate_has_a_folder_for_each_run_and_ends_with_one_table(c
     assert main([*EVALUATE, "agents=[mobil,keep_lane]"]) == 0
     (folder,) = Path("outputs/evaluate_sweeps").iterdir()
     for seed in (0, 1):
-        results = json.loads((folder / str(seed) / "results.json").read_text())
+        results = results_in(folder / str(seed))
         assert results["config"]["seed"] == seed
     table = capsys.readouterr().out.rpartition("results: ")[2]
     assert table.count("keep_lane") == 2

@@ -1,13 +1,12 @@
 """``ganlane train`` from end to end, with tiny budgets, in process."""
 
-import json
 import shutil
 import signal
 from functools import partial
 
 import entry_tiny
 import pytest
-from reference.refusals import last_path
+from reference.refusals import last_path, results_in
 from training.small_runs import rows, signal_at
 
 import ganlane
@@ -34,12 +33,12 @@ def finished(tmp_path_factory):
 def train(capsys, *arguments):
     """Run folder and results of a run that succeeds."""
     assert main([*TINY, *arguments]) == 0
-    path = last_path(capsys.readouterr().out)
-    return path.parent, json.loads(path.read_text())
+    folder = last_path(capsys.readouterr().out).parent
+    return folder, results_in(folder)
 
 
 def test_a_run_leaves_agent_metrics_config_and_table(finished):
-    results = json.loads((finished / "results.json").read_text())
+    results = results_in(finished)
     agents = [row["agent"] for row in results["rows"]]
     assert agents == ["trained", "mobil", "random_legal"]
     assert results["decisions"] == 320
@@ -88,7 +87,7 @@ def test_every_traffic_and_every_start_runs(traffic, init, capsys):
         "evaluation.agents=[keep_lane] evaluation.episodes=1 agent.capacity=1000"
     )
     assert main([f"traffic={traffic}", f"init={init}", *words.split()]) == 0
-    results = json.loads(last_path(capsys.readouterr().out).read_text())
+    results = results_in(last_path(capsys.readouterr().out).parent)
     assert [row["traffic"] for row in results["rows"]] == [traffic, traffic]
 
 

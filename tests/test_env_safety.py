@@ -8,6 +8,7 @@ from dataclasses import asdict
 
 import pytest
 import torch
+from reference.marks import slow
 from reference.traffics import all_faults, keep_lane
 from reference.worlds import random_environment
 
@@ -71,7 +72,7 @@ def drive(rng: random.Random, most_vehicles: int, duration_s: float) -> float:
 
 @pytest.mark.parametrize(
     ("vehicle_km", "roads", "most_vehicles", "duration_s"),
-    [(100.0, 15, 30, 8.0), pytest.param(10_000.0, 30, 60, 60.0, marks=pytest.mark.slow)],
+    [(100.0, 15, 30, 8.0), slow(10_000.0, 30, 60, 60.0)],
 )
 def test_no_overlap_in_so_many_km_on_so_many_roads(vehicle_km, roads, most_vehicles, duration_s):
     rng = random.Random(0)
@@ -97,15 +98,10 @@ FAULTS = {"name": "idm_faults", **asdict(all_faults(120.0, 0.5))}
         ("gan_calibrated", 8, LORRIES, 40.0),
         ("idm_random", 64, CROWD, 500.0),
         (FAULTS, 24, CROWD | RECYCLED, 100.0),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (
-                ("idm", 64, LORRIES | RECYCLED, 1760.0),
-                ("idm_mobil", 64, LORRIES | RECYCLED, 1800.0),
-                ("gan_calibrated", 48, LORRIES | RECYCLED, 840.0),
-                ("idm_faults", 128, CROWD | RECYCLED, 5000.0),
-            )
-        ),
+        slow("idm", 64, LORRIES | RECYCLED, 1760.0),
+        slow("idm_mobil", 64, LORRIES | RECYCLED, 1800.0),
+        slow("gan_calibrated", 48, LORRIES | RECYCLED, 840.0),
+        slow("idm_faults", 128, CROWD | RECYCLED, 5000.0),
     ],
     ids=str,
 )

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import pytest
 import torch
 from reference import scalar
+from reference.marks import slow
 from reference.worlds import (
     KINDS,
     disturbed_start,
@@ -122,9 +123,7 @@ def test_on_a_ring_they_agree_too():
     compare(env, env.reset(), duration_s=10.0, act=by_mobil(env))
 
 
-@pytest.mark.parametrize(
-    ("rows", "goal_m"), [(2, 150.0), pytest.param(15, 5000.0, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("rows", "goal_m"), [(2, 150.0), slow(15, 5000.0)])
 @pytest.mark.parametrize("mobil", [True, False])
 def test_whole_episodes_agree_to_their_end(mobil, rows, goal_m):
     env = environment(num_envs=rows, mobil=mobil, goal_m=goal_m, first_episode=1000 * mobil)

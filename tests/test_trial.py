@@ -1,10 +1,10 @@
 """The trial of the package sees what breaks: damaged files that are read, broken invariants."""
 
-import os
 from pathlib import Path
 
 import pytest
 import torch
+from reference.marks import needs_fork
 from trial import damages
 from trial.damage import READERS, SCENE, Reader, Trial
 from trial.soak import actions, violations
@@ -13,7 +13,7 @@ import ganlane
 from ganlane import keys
 from ganlane.errors import UserError
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+pytestmark = needs_fork
 CHOICE = {"traffic": {"name": "idm_mobil"}, "policy": "random", "env": "highway"}
 
 

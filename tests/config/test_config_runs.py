@@ -13,6 +13,7 @@ from unittest.mock import patch
 import pytest
 import torch
 from hydra.core.override_parser.types import Quote, QuotedString
+from reference.marks import slow
 from reference.processes import run, start
 from reference.refusals import user_error
 from training.small_runs import agent, road, train
@@ -32,12 +33,10 @@ from ganlane.config.run import (
 from ganlane.errors import UserError
 from ganlane.training.checkpoint import LAST, load_checkpoint
 
+pytestmark = pytest.mark.usefixtures("empty_folder")
+#: The folder of a run.
+RUN = Path("run")
 COLUMNS = ("decisions", "updates", "mean_return", "loss", "out_of_road_rate")
-
-
-@pytest.fixture(autouse=True)
-def here(empty_folder):
-    return empty_folder
 
 
 def short_run(config, folder):
@@ -51,7 +50,7 @@ def short_run(config, folder):
 
     resume = folder / LAST if config.resume else None
     often = schedule(160, log_every=40, evaluate_every=80, checkpoint_every_s=0.0)
-    train(road(8), learner, often, folder, evaluate, resume=resume)
+    train(road(), learner, often, folder, evaluate, resume=resume)
 
 
 def command(*arguments, task=short_run):
@@ -92,52 +91,46 @@ class Disk:
         self.fsync(handle)
 
 
-@pytest.mark.parametrize(
-    "writes", [3, 7, 10, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 4, 5, 6, 8, 9, 11))]
-)
+@pytest.mark.parametrize("writes", [3, 7, 10, *map(slow, (2, 4, 5, 6, 8, 9, 11))])
 def test_a_run_ended_by_a_full_disk_goes_on_to_the_same_weights(
-    writes, here, undisturbed, monkeypatch, capsys
+    writes, undisturbed, monkeypatch, capsys
 ):
     with monkeypatch.context() as patch:
         patch.setattr("ganlane.files.os.fsync", Disk(writes))
         patch.setattr("ganlane.training.checkpoint.PATIENCE", 0.0)
         assert command("hydra.run.dir=run") == 2
     assert "No space left on device; check the path" in capsys.readouterr().err
-    assert not list(here.rglob("*.part"))
-    assert (
-        (here / "run" / LAST).is_file()
-        == (here / "run" / CONFIG).is_file()
-        == (here / "run").exists()
-    )
-    assert command("resume=run" if (here / "run").exists() else "hydra.run.dir=run") == 0
-    assert same(left_by(here / "run"), undisturbed)
+    assert not list(Path().rglob("*.part"))
+    assert (RUN / LAST).is_file() == (RUN / CONFIG).is_file() == RUN.exists()
+    assert command("resume=run" if RUN.exists() else "hydra.run.dir=run") == 0
+    assert same(left_by(RUN), undisturbed)
 
 
-def test_a_run_that_ends_in_an_error_after_training_keeps_its_command_line(here, capsys):
+def test_a_run_that_ends_in_an_error_after_training_keeps_its_command_line(capsys):
     def task(config, folder):
         short_run(config, folder)
         raise UserError("a worker died")
 
     assert command("hydra.run.dir=run", "env.lanes=4", task=task) == 2
-    assert "lanes: 4" in (here / "run" / CONFIG).read_text()
+    assert "lanes: 4" in (RUN / CONFIG).read_text()
     assert command("resume=run", "log_every=50", task=task) == 2
-    assert "log_every: 50" in (here / "run" / CONFIG).read_text()
+    assert "log_every: 50" in (RUN / CONFIG).read_text()
     assert command("resume=run") == 0
 
 
-def test_a_second_run_in_a_folder_is_refused_while_the_first_is_at_work(here, capsys):
+def test_a_second_run_in_a_folder_is_refused_while_the_first_is_at_work(capsys):
     def second(config, folder):
-        before = sorted(here.rglob("*"))
+        before = sorted(Path().rglob("*"))
         assert command("hydra.run.dir=run") == 2
         assert f"run: a run is at work there (process {os.getpid()} on " in capsys.readouterr().err
-        assert sorted(here.rglob("*")) == before
+        assert sorted(Path().rglob("*")) == before
 
     assert command("hydra.run.dir=run", task=second) == 0
-    assert not (here / "run" / LOCK).exists()
+    assert not (RUN / LOCK).exists()
     assert command("hydra.run.dir=run") == 0
 
 
-def test_the_lock_of_a_killed_run_stops_nobody_and_its_half_written_files_go(here):
+def test_the_lock_of_a_killed_run_stops_nobody_and_its_half_written_files_go():
     script = (
         "import time; from pathlib import Path; from ganlane.config.run import held\n"
         "from ganlane.files import atomic_path\n"
@@ -146,18 +139,15 @@ def test_the_lock_of_a_killed_run_stops_nobody_and_its_half_written_files_go(her
     )
     with start("-c", script) as process:
         assert process.stdout.readline() == "at work\n"
-        with (
-            user_error(rf"process {process.pid} on .*; wait for its end"),
-            held(Path("run")),
-        ):
+        with user_error(rf"process {process.pid} on .*; wait for its end"), held(RUN):
             pass
         process.kill()
-    assert (here / "run" / LOCK).is_file()
-    assert len(list(here.rglob("*.part"))) == 1
-    (here / "run" / ".a.film.part").write_text("of another program")
-    with held(Path("run")):
-        assert [path.name for path in here.rglob("*.part")] == [".a.film.part"]
-    assert not (here / "run" / LOCK).exists()
+    assert (RUN / LOCK).is_file()
+    assert len(list(Path().rglob("*.part"))) == 1
+    (RUN / ".a.film.part").write_text("of another program")
+    with held(RUN):
+        assert [path.name for path in Path().rglob("*.part")] == [".a.film.part"]
+    assert not (RUN / LOCK).exists()
 
 
 # --- the settings of a resumed run
@@ -174,8 +164,8 @@ def make_run(folder, words=(), age_s=0, finished=False):
         (folder / "results.json").touch()
 
 
-def test_a_resumed_run_keeps_its_settings_but_for_those_on_the_command_line(here):
-    make_run(here / "run", ["traffic=idm", "seed=3", "env.lanes=4", "agent.gamma=0.5"])
+def test_a_resumed_run_keeps_its_settings_but_for_those_on_the_command_line():
+    make_run(RUN, ["traffic=idm", "seed=3", "env.lanes=4", "agent.gamma=0.5"])
     config = settings("train", ["resume=run", "seed=4", "agent.gamma=0.6", "env.vehicles=5"])
     assert (config.traffic.label(), config.seed, config.resume) == ("idm", 4, "run")
     assert (config.env.lanes, config.env.vehicles, config.agent.gamma) == (4, 5, 0.6)
@@ -193,24 +183,24 @@ def test_a_resumed_run_keeps_its_settings_but_for_those_on_the_command_line(here
     ],
     ids=" ".join,
 )
-def test_a_resumed_run_is_the_run_that_was_stopped(words, here):
-    make_run(here / "run", words)
+def test_a_resumed_run_is_the_run_that_was_stopped(words):
+    make_run(RUN, words)
     trusted = [word for word in words if "_target_" in word]
     resumed = settings("train", ["resume=run", *trusted])
     assert replace(resumed, resume=None) == settings("train", words)
 
 
-def test_a_checkpoint_stands_for_its_run(here):
-    make_run(here / "run", ["seed=7"])
-    make_run(here / "run" / "pretrain")
-    (here / "run" / "pretrain" / CONFIG).unlink()
+def test_a_checkpoint_stands_for_its_run():
+    make_run(RUN, ["seed=7"])
+    make_run(RUN / "pretrain")
+    (RUN / "pretrain" / CONFIG).unlink()
     for path in ("run/checkpoints/last.pt", "run/pretrain", "run/pretrain/checkpoints/last.pt"):
         config = settings("train", [f"resume={path}"])
         assert (config.resume, config.seed) == ("run", 7)
 
 
-def test_auto_takes_the_newest_unfinished_run(here):
-    runs = here / "outputs" / "train"
+def test_auto_takes_the_newest_unfinished_run():
+    runs = Path("outputs/train")
     make_run(runs / "old", age_s=100)
     make_run(runs / "new", age_s=50)
     make_run(runs / "done", finished=True)
@@ -233,8 +223,8 @@ def test_a_sweep_is_every_combination():
 
 
 @pytest.mark.parametrize("name", ["it's", "two words, [one]", "back\\"])
-def test_a_folder_may_be_called_anything(name, here):
-    make_run(here / name, ["seed=3"])
+def test_a_folder_may_be_called_anything(name):
+    make_run(Path(name), ["seed=3"])
     word = "resume=" + QuotedString(name, Quote.single).with_quotes()
     config = settings("train", [word])
     assert (config.seed, config.resume) == (3, name)

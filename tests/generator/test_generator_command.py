@@ -3,13 +3,12 @@
 On recordings as they are published, with folds and resuming.
 """
 
-import json
 from pathlib import Path
 
 import polars as pl
 import pytest
 from reference.recordings import START_MS, ngsim_rows, portal_csv, raw_text, traffic
-from reference.refusals import refusal
+from reference.refusals import refusal, results_in
 
 from ganlane.config.run import run_command
 from ganlane.data import driving_statistics, read_scenes
@@ -28,7 +27,7 @@ def run(*arguments):
     """Results of a fit, and the metadata of its weights."""
     assert run_command("train_generator", [*arguments, *FEW, "hydra.run.dir=fit"]) == 0
     _, metadata = load_generator("fit/generator_paper.safetensors", "paper")
-    results = json.loads(Path("fit/results.json").read_text())
+    results = results_in(Path("fit"))
     assert metadata["data"] == results["data"]
     forecasts = {"mean", "single", "best_of_20", "constant_velocity", "idm_own_headway"}
     assert results["ade_m"].keys() == results["fde_m"].keys() == forecasts

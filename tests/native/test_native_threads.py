@@ -1,12 +1,12 @@
 """Threads of the kernel: they share the rows, and the numbers are those of one thread."""
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 
 import numpy as np
 import pytest
 from reference import processes
+from reference.marks import needs_fork
 
 from ganlane.gym.base import make_rows
 from ganlane.native.library import BLOCK, ROWS_PER_THREAD
@@ -72,7 +72,7 @@ print(total)
 """
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@needs_fork
 def test_a_forked_process_drives_on_with_threads_of_its_own():
     done = processes.run("-W", "ignore", "-c", FORKED)
     assert done.returncode == 0, done.stderr

@@ -1,12 +1,10 @@
 """``ganlane realism`` from end to end, with tiny budgets, in process."""
 
-import json
-
 import polars as pl
 import pytest
 from PIL import Image
 from reference.recordings import following_file
-from reference.refusals import last_path, refusal
+from reference.refusals import last_path, refusal, results_in
 from reference.scene_csv import write_scene_csv
 from reference.synthetic import synthetic_scenes
 
@@ -30,11 +28,11 @@ def recordings(empty_folder):
 
 
 def run(capsys, *arguments):
-    """results.json with its folder, stdout, stderr."""
+    """The results with their folder, stdout, stderr."""
     assert run_command("realism", [*QUICK, *arguments]) == 0
     out, err = capsys.readouterr()
-    path = last_path(out)
-    return {**json.loads(path.read_text()), "folder": path.parent}, out, err
+    folder = last_path(out).parent
+    return {**results_in(folder), "folder": folder}, out, err
 
 
 def test_a_users_own_traffic_gets_a_card_of_every_quantity_and_one_of_i80_beside_the_scenes(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
+from reference.marks import slow
 from reference.worlds import leaves
 from tensordict import TensorDictBase
 
@@ -15,7 +15,7 @@ from ganlane.native.tensors import Kernel
 #: Instruction sets of this processor. The one for any processor takes long to build and to drive;
 #: .ci/run has a step for it.
 RUNNABLE = [
-    pytest.param(name, marks=pytest.mark.slow) if name == "default" else name
+    slow(name) if name == "default" else name
     for name in list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
 ]
 #: Parts of all kinds; no batch size of the tests is a multiple of the sum of their shares.

@@ -5,8 +5,10 @@ Or naming their results.
 
 from __future__ import annotations
 
+import json
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -48,6 +50,11 @@ def is_one_sentence(err: str, command: str) -> bool:
 def last_path(out: str) -> Path:
     """What the last line of a command's output names."""
     return Path(out.splitlines()[-1].partition(": ")[2])
+
+
+def results_in(folder: Path) -> dict[str, Any]:
+    """What a command has left in ``results.json``."""
+    return json.loads((folder / "results.json").read_text())
 
 
 class Bomb:

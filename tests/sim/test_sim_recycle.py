@@ -4,6 +4,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.marks import slow
 from reference.worlds import (
     drawing,
     environment,
@@ -139,14 +140,9 @@ def company_by_km(on, cars, rows, goal_m):
     ("on", "cars", "rows", "goal_m", "least"),
     [
         (True, 9, 8, 1500.0, 7.5),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (
-                (True, 9, 8, 5000.0, 7.5),
-                (True, 30, 16, 5000.0, 20.0),
-                (False, 9, 8, 5000.0, 4.0),
-            )
-        ),
+        slow(True, 9, 8, 5000.0, 7.5),
+        slow(True, 30, 16, 5000.0, 20.0),
+        slow(False, 9, 8, 5000.0, 4.0),
     ],
 )
 def test_with_it_the_ego_keeps_its_company_and_without_it_loses_it(on, cars, rows, goal_m, least):

@@ -7,6 +7,7 @@ import math
 
 import pytest
 import torch
+from reference.marks import slow
 from reference.worlds import drawing, moves, vehicles, vehicles_at
 
 from ganlane.settings.driving import Visibility
@@ -133,10 +134,10 @@ def drive(lane_width_m, length_m):
     ("lane_width_m", "length_m", "before"),
     [
         (2.55, 4.5, 229),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in ((2.7, 4.5, 157), (2.9, 4.5, 66), (3.0, 4.5, 7), (3.5, 12.0, None))
-        ),
+        slow(2.7, 4.5, 157),
+        slow(2.9, 4.5, 66),
+        slow(3.0, 4.5, 7),
+        slow(3.5, 12.0, None),
     ],
 )
 def test_who_changes_two_lanes_in_a_row_does_not_touch_the_slower_car_in_between(

@@ -1,9 +1,8 @@
 """The comparison on recorded scenes: the scene of each episode, and what the record holds."""
 
-import json
-
 import pytest
 import torch
+from reference.refusals import results_in
 
 import ganlane
 from ganlane.commands.evaluate import publish
@@ -33,7 +32,7 @@ def test_every_replayed_episode_has_the_scene_that_it_ran_in(table, three_scenes
 
 def test_the_record_holds_rows_paired_leads_failures_and_crashes_by_scene(table, tmp_path, capsys):
     publish(table, tmp_path, EvaluateConfig(columns="all"), {})
-    record = json.loads((tmp_path / "results.json").read_text())
+    record = results_in(tmp_path)
     assert record["rows"] == as_json(evaluation_rows(table))
     assert record["paired"] == as_json(paired_rows(table))
     assert record["failures"] == failed_episodes(table)
@@ -57,4 +56,4 @@ def test_no_recorded_start_is_driven_twice_however_many_episodes_are_asked_for(t
 
 def test_other_traffics_have_no_scenes(table, tmp_path):
     publish(table.filter(traffic="idm").drop("scene"), tmp_path, EvaluateConfig(columns="all"), {})
-    assert "crashes_by_scene" not in json.loads((tmp_path / "results.json").read_text())
+    assert "crashes_by_scene" not in results_in(tmp_path)

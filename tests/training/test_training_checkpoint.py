@@ -13,7 +13,7 @@ from ganlane.training.checkpoint import LAST, TrainingState, load_checkpoint, sa
 def stopped(tmp_path_factory):
     """The state of a run that has learned."""
     folder = tmp_path_factory.mktemp("stopped")
-    train(road(8), agent(), settings(160, log_every=72), folder)
+    train(road(), agent(), settings(160, log_every=72), folder)
     return load_checkpoint(folder / LAST)
 
 
@@ -46,12 +46,12 @@ def test_a_part_of_a_run_that_is_something_else_is_refused_in_one_sentence(
     value, told = DAMAGE[place]
     save_checkpoint(tmp_path / "last.pt", with_damage(stopped, place, value))
     with user_error(rf"^resume=[^\n]*last\.pt: [^\n]*{told}[^\n]*\.$"):
-        TrainingState(road(8), agent()).restore(tmp_path / "last.pt")
+        TrainingState(road(), agent()).restore(tmp_path / "last.pt")
 
 
 def test_the_parts_of_a_run_are_those_of_this_run(stopped, tmp_path):
     save_checkpoint(tmp_path / "last.pt", stopped)
-    assert TrainingState(road(8), agent()).restore(tmp_path / "last.pt") is None
+    assert TrainingState(road(), agent()).restore(tmp_path / "last.pt") is None
 
 
 KIND = "ganlane training checkpoint"
@@ -76,5 +76,5 @@ def test_what_is_no_state_of_a_run_is_refused(content, empty_folder):
         torch.save(content, path)
         seal_archive(path)
     with user_error(r"^resume=[^\n]*last\.pt"):
-        TrainingState(road(8), agent()).restore(path)
+        TrainingState(road(), agent()).restore(path)
     assert not (empty_folder / "executed").exists()

@@ -7,6 +7,7 @@ import time
 import pytest
 import torch
 from agents.agents_small import same_weights, transitions
+from reference.marks import needs_fork
 from training.small_runs import OBSERVATION_SIZE, agent, road, rows, settings, signal_at, train
 
 from ganlane.agents import Rainbow, RainbowConfig, load_agent
@@ -22,7 +23,7 @@ def whole(tmp_path_factory):
     """The agent and the folder of a run in one piece."""
     folder = tmp_path_factory.mktemp("whole")
     learner = agent()
-    train(road(8), learner, WHOLE, folder)
+    train(road(), learner, WHOLE, folder)
     return learner, folder
 
 
@@ -55,10 +56,10 @@ def test_there_is_one_update_per_decisions_per_update_whatever_the_batch(environ
 
 @pytest.mark.parametrize("decisions", [8, 400])  # while the buffer is empty, and when it is full
 def test_an_interrupted_and_resumed_run_gives_the_same_weights(decisions, whole, tmp_path, capsys):
-    first = train(road(8), agent(), settings(decisions, log_every=240), tmp_path)
+    first = train(road(), agent(), settings(decisions, log_every=240), tmp_path)
     torch.manual_seed(99)
     resumed = agent(seed=5)
-    result = train(road(8), resumed, WHOLE, tmp_path, resume=first.checkpoint)
+    result = train(road(), resumed, WHOLE, tmp_path, resume=first.checkpoint)
     assert same_weights(whole[0], resumed)
     assert "bit-exact" not in capsys.readouterr().err
     assert result.progress["decisions"] == 480
@@ -72,15 +73,15 @@ def test_an_interrupted_and_resumed_run_gives_the_same_weights(decisions, whole,
 def test_a_light_checkpoint_refills_the_buffer_before_its_first_update_and_says_so(
     tmp_path, capsys
 ):
-    first = train(road(8), agent(), settings(160, checkpoint_replay=False), tmp_path)
+    first = train(road(), agent(), settings(160, checkpoint_replay=False), tmp_path)
     resumed = agent()
     light = settings(216, progress=True)
-    result = train(road(8), resumed, light, tmp_path, resume=first.checkpoint)
+    result = train(road(), resumed, light, tmp_path, resume=first.checkpoint)
     assert "not bit-exact" in capsys.readouterr().err
     assert len(resumed.replay) == 40  # 7 steps of 8, of which the new window of 3 still holds 2
     assert result.progress["updates"] == first.progress["updates"]
     more = settings(224 + 32)
-    result = train(road(8), resumed, more, tmp_path, resume=first.checkpoint)
+    result = train(road(), resumed, more, tmp_path, resume=first.checkpoint)
     assert result.progress["updates"] == first.progress["updates"] + 3
 
 
@@ -90,7 +91,7 @@ def test_a_light_checkpoint_of_the_full_sized_network_is_under_5_mb(tmp_path):
     learner.store(transitions(OBSERVATION_SIZE))
     learner.update()
     light = settings(480, checkpoint_replay=False)
-    Checkpointer(TrainingState(road(8), learner), tmp_path, light, {}).save()
+    Checkpointer(TrainingState(road(), learner), tmp_path, light, {}).save()
     assert 3e6 < (tmp_path / "checkpoints" / "last.pt").stat().st_size < 5e6
 
 
@@ -98,12 +99,12 @@ def test_a_signal_ends_the_run_after_its_step_with_a_checkpoint(whole, tmp_path)
     number = signal.SIGTERM
     handler = signal.getsignal(number)
     with signal_at(160, number):
-        stopped = loop.train(road(8), agent(), WHOLE, tmp_path)
+        stopped = loop.train(road(), agent(), WHOLE, tmp_path)
     assert stopped.stopped_by == number
     assert stopped.progress["decisions"] == 160
     assert signal.getsignal(number) == handler
     resumed = agent()
-    train(road(8), resumed, WHOLE, tmp_path, resume=stopped.checkpoint)
+    train(road(), resumed, WHOLE, tmp_path, resume=stopped.checkpoint)
     assert same_weights(whole[0], resumed)
 
 
@@ -117,7 +118,7 @@ def test_the_best_evaluated_agent_is_kept_and_the_last_one_too(tmp_path):
         return {"mean_reward": next(scores), "crash_rate": 0.5}
 
     often = settings(240, evaluate_every=80)
-    result = train(road(8), learner, often, tmp_path, evaluate)
+    result = train(road(), learner, often, tmp_path, evaluate)
     assert result.best == 3.0
     assert [row["mean_reward"] for row in rows(tmp_path / "evaluation.csv")] == [1.0, 3.0, 2.0]
     (best, metadata), (last, _) = (
@@ -135,13 +136,13 @@ def train_until_killed(folder):
     if child == 0:
         try:
             checkpoint.PATIENCE = 0.0
-            train(road(8), agent(), settings(10**9, checkpoint_every_s=0.0), folder)
+            train(road(), agent(), settings(10**9, checkpoint_every_s=0.0), folder)
         finally:
             os._exit(1)
     return child
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@needs_fork
 def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights(tmp_path):
     """Killed a tenth of a second after its first checkpoint; other moments are in tests/trial."""
     folder = tmp_path / "parts"
@@ -155,6 +156,6 @@ def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights(tmp_path):
     os.waitpid(child, 0)
     more = settings(int(load_checkpoint(last)["counters"]["decisions"]) + 160)
     resumed, whole = agent(seed=5), agent()
-    train(road(8), resumed, more, folder, resume=last)
-    train(road(8), whole, more, tmp_path / "whole")
+    train(road(), resumed, more, folder, resume=last)
+    train(road(), whole, more, tmp_path / "whole")
     assert same_weights(whole, resumed)

@@ -83,6 +83,13 @@ def empty_folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.fixture
+def no_recordings(empty_folder, monkeypatch):
+    """Those of this machine are not found; the empty folder in which they are looked for."""
+    monkeypatch.setenv("GANLANE_DATA", str(empty_folder))
+    return empty_folder
+
+
 @pytest.fixture(scope="session")
 def three_scenes(tmp_path_factory):
     """A scene CSV of three made-up scenes of 7 s."""

@@ -41,12 +41,11 @@ def test_help_is_printed_and_keys_are_refused(capsys):
     assert capsys.readouterr().err == told
 
 
-def test_recordings_are_found_or_asked_for(tmp_path, monkeypatch):
-    monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
+def test_recordings_are_found_or_asked_for(no_recordings):
     with user_error("set GANLANE_DATA"):
         doctor.recordings()
-    (tmp_path / "us101_scenes.csv").touch()
-    assert doctor.recordings() == str(tmp_path / "us101_scenes.csv")
+    (no_recordings / "us101_scenes.csv").touch()
+    assert doctor.recordings() == str(no_recordings / "us101_scenes.csv")
 
 
 def test_the_kernel_is_driven_and_without_one_a_compiler_asked_for(monkeypatch):

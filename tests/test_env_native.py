@@ -27,7 +27,8 @@ pytestmark = pytest.mark.kernel
 
 
 def native(num_envs: int = 8, **others):
-    return environment(num_envs=num_envs, dtype=torch.float32, **{"kernel": "native", **others})
+    options = {"dtype": torch.float32, "kernel": "native", **others}
+    return environment(num_envs=num_envs, **options)
 
 
 def test_its_keys_specs_and_first_states_are_those_of_the_tensor_code():
@@ -94,13 +95,13 @@ def test_episodes_that_are_no_whole_numbers_in_a_row_are_refused(wrong):
 )
 def test_what_the_kernel_cannot_do_it_refuses_in_one_sentence(settings, sentence):
     with user_error(sentence):
-        environment(**{"dtype": torch.float32, "kernel": "native", **settings})
+        native(**settings)
 
 
 def test_auto_takes_the_tensor_code_where_the_kernel_cannot_and_says_once_when_it_can(capsys):
     say_once.cache_clear()
     assert environment(kernel="auto").kernel is None
-    two = [environment(kernel="auto", dtype=torch.float32) for _ in range(2)]
+    two = [native(kernel="auto") for _ in range(2)]
     assert all(env.kernel is not None for env in two)
     assert capsys.readouterr().err == ""
     for env in two:

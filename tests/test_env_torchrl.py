@@ -101,20 +101,23 @@ def test_a_step_compiles_to_one_graph():
     assert same_bits(step(state)["next"], plain["next"]) == []
 
 
-@pytest.mark.parametrize("kernel", ["torch", "auto"])
-def test_gradients_pass_through_a_decision(kernel):
+def decided_with_gradients(kernel):
+    """Speeds whose gradients are asked for, and the state after a decision from them."""
     env = ganlane.make_env("idm_mobil", 2, kernel=kernel)
     speed = env.reset()[keys.VEHICLES, "speed"].requires_grad_()
-    after = decided(env, vehicles={"speed": speed})
+    return speed, decided(env, vehicles={"speed": speed})
+
+
+@pytest.mark.parametrize("kernel", ["torch", "auto"])
+def test_gradients_pass_through_a_decision(kernel):
+    speed, after = decided_with_gradients(kernel)
     for name in (keys.REWARD, keys.OBSERVATION):
         (gradient,) = torch.autograd.grad(after[name].sum(), speed, retain_graph=True)
         assert (gradient[:, 0] != 0).all()
 
 
 def test_the_kernel_alone_refuses_gradients():
-    env = ganlane.make_env("idm_mobil", 2, kernel="native")
-    speed = env.reset()[keys.VEHICLES, "speed"].requires_grad_()
     with user_error(r"under torch\.no_grad"):
-        decided(env, vehicles={"speed": speed})
+        decided_with_gradients("native")
     with torch.no_grad():
-        decided(env, vehicles={"speed": speed})
+        decided_with_gradients("native")

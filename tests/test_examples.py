@@ -38,14 +38,14 @@ def test_every_example_is_run_here():
     assert names == {line.split()[0] for line in EXAMPLES}
 
 
+@pytest.mark.usefixtures("no_recordings")  # whether there are some has no effect
 @pytest.mark.parametrize("line", EXAMPLES)
-def test_the_example_runs_and_prints_its_result(line, monkeypatch, capsys, empty_folder):
+def test_the_example_runs_and_prints_its_result(line, monkeypatch, capsys):
     if line.startswith("sb3_"):
         pytest.importorskip("sb3_contrib", reason="the extra sb3 is not installed")
     monkeypatch.setattr(sys, "argv", line.split())
-    # Of a suite two episodes on each traffic; whether recordings are at hand has no effect.
+    # Of a suite two episodes on each traffic.
     monkeypatch.setattr("ganlane.settings.suite.QUICK_SHARE", 0.0)
-    monkeypatch.setenv("GANLANE_DATA", str(empty_folder))
     with torch.random.fork_rng():
         runpy.run_path(str(ROOT / "examples" / line.split()[0]), run_name="__main__")
     assert re.search(EXAMPLES[line], capsys.readouterr().out)

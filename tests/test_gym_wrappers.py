@@ -38,8 +38,8 @@ def test_infos_of_a_batch_can_be_had_row_by_row():
     assert infos[0]["reward_terms"].keys() == infos[1]["reward_terms"].keys()
 
 
-def test_the_code_in_the_docs_runs(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("empty_folder")
+def test_the_code_in_the_docs_runs():
     blocks = python_blocks("gymnasium.md")
     films = importlib.util.find_spec("moviepy") is not None
     names = {"np": np}

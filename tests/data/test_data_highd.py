@@ -20,6 +20,11 @@ def recording(tmp_path):
     return tmp_path / "01_tracks.csv"
 
 
+def assert_refused(path, sentence):
+    with user_error(sentence):
+        read_recordings("highd", path)
+
+
 def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(recording):
     upper, lower = highd_scenes(recording, RowCount())
     assert (upper.name, lower.name) == ("highd-01-upper", "highd-01-lower")
@@ -77,29 +82,23 @@ def test_rows_off_the_lanes_are_dropped_and_end_a_track(recording):
 )
 def test_a_damaged_field_is_named(recording, column, row, value, message):
     damage_field(recording, column, row, value)
-    with user_error(f"01_tracks.csv, {message}"):
-        read_recordings("highd", recording)
+    assert_refused(recording, f"01_tracks.csv, {message}")
 
 
 def test_units_that_cannot_be_are_refused(recording):
     # In km/h.
     pl.read_csv(recording).with_columns(pl.col("xVelocity") * 3.6).write_csv(recording)
-    with user_error(r"highd-01-upper.*column speed: the median is 1\d\d"):
-        read_recordings("highd", recording)
+    assert_refused(recording, r"highd-01-upper.*column speed: the median is 1\d\d")
 
 
 def test_the_metadata_files_are_required_and_checked(recording):
     meta = recording.with_name("01_recordingMeta.csv")
     # First the markings, then files that are not there.
     damage_field(meta, "upperLaneMarkings", 0, "8.0;moon")
-    with user_error(r"recordingMeta.csv, line 2, column upperlanemarkings: '8.0;moon'"):
-        read_recordings("highd", recording)
+    assert_refused(recording, r"recordingMeta.csv, line 2, column upperlanemarkings: '8.0;moon'")
     meta.unlink()
-    with user_error(r"01_recordingMeta.csv: no such file"):
-        read_recordings("highd", recording)
+    assert_refused(recording, r"01_recordingMeta.csv: no such file")
     write_highd(recording.parent)
     damage_field(recording.with_name("01_tracksMeta.csv"), "drivingDirection", 1, "3")
-    with user_error(r"01_tracksMeta.csv, line 3, column drivingdirection: 3 is neither"):
-        read_recordings("highd", recording)
-    with user_error(r"no XX_tracks.csv in this folder"):
-        read_recordings("highd", recording.parent.parent)
+    assert_refused(recording, r"01_tracksMeta.csv, line 3, column drivingdirection: 3 is neither")
+    assert_refused(recording.parent.parent, r"no XX_tracks.csv in this folder")

@@ -12,12 +12,8 @@ from ganlane.config.run import run_command
 from ganlane.realism.measures import QUANTITIES
 from ganlane.realism.sheets import card_text
 
+pytestmark = pytest.mark.usefixtures("no_recordings")
 QUICK = ["quick=true", "vehicle_km=0.5", "long_s=10", "long_vehicles=[4]"]
-
-
-@pytest.fixture(autouse=True)
-def _without_recordings_of_this_machine(empty_folder, monkeypatch):
-    monkeypatch.setenv("GANLANE_DATA", str(empty_folder))
 
 
 @pytest.fixture

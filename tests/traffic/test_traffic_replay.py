@@ -154,8 +154,8 @@ def test_a_scene_file_is_read(tmp_path):
     )
 
 
-def test_without_recordings_it_says_what_to_do(tmp_path, monkeypatch):
-    monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
+@pytest.mark.usefixtures("no_recordings")
+def test_without_recordings_it_says_what_to_do():
     with user_error(r"no recordings found.*traffic.path=FILE.*GANLANE_DATA"):
         ReplayTraffic()
 

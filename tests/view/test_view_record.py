@@ -35,6 +35,13 @@ def recorded(env, action=0, **options):
     return record_episode(env, always, **{"seed": 0, "episode": 0, **options})
 
 
+def recorded_agent(name, **options):
+    """The first episode of an agent that ships."""
+    driver = ganlane.load_agent(name)
+    env = ganlane.make_env(observation=driver.observation, **options)
+    return record_episode(env, driver.policy, seed=0, episode=0)
+
+
 @pytest.fixture(scope="module")
 def short():
     return recorded(highway())
@@ -88,9 +95,7 @@ def test_an_environment_without_the_hook_cannot_be_recorded():
 
 def test_a_network_tells_its_values_and_the_rewards_add_up(short):
     """A policy of a Q-network leaves what it expected at each decision; others leave nothing."""
-    driver = ganlane.load_agent("agent_idm")
-    env = ganlane.make_env(observation=driver.observation, goal_m=60.0)
-    trajectory = record_episode(env, driver.policy, seed=0, episode=0)
+    trajectory = recorded_agent("agent_idm", goal_m=60.0)
     values, reward = trajectory.action_values, trajectory.reward
     assert values.shape == (len(trajectory), 3)
     assert np.isnan(values[0]).all()
@@ -104,10 +109,7 @@ def test_a_network_tells_its_values_and_the_rewards_add_up(short):
 
 
 def test_an_agent_with_the_pedals_is_recorded_too():
-    driver = ganlane.load_agent("agent_merge")
-    options = {"env": "merge", "actions": "continuous", "observation": driver.observation}
-    env = ganlane.make_env(goal_m=100.0, **options)
-    trajectory = record_episode(env, driver.policy, seed=0, episode=0)
+    trajectory = recorded_agent("agent_merge", env="merge", actions="continuous", goal_m=100.0)
     assert (trajectory.action == -1).all()
     assert trajectory.x[-1, 0] >= 100.0
 

@@ -14,6 +14,7 @@ if SITE is None:
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     with browser_page(tmp_path_factory.mktemp("profile")) as opened:
+        opened.size(1280, 900)
         yield opened
 
 
@@ -21,13 +22,11 @@ def page(tmp_path_factory):
     "file", sorted(Path(SITE).rglob("index.html")), ids=lambda path: path.parent.name
 )
 def test_no_page_scrolls_sideways(page, file):
-    page.size(1280, 900)
     page.open(file)
     assert page.value("document.documentElement.scrollWidth") <= 1280
 
 
 def test_the_first_page_has_three_cards_side_by_side_and_equations_need_no_script(page):
-    page.size(1280, 900)
     page.open(Path(SITE) / "index.html")
     cards = page.value(
         "[...document.querySelectorAll('.cards li')].map((e) => e.getBoundingClientRect().top)"

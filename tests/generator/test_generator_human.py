@@ -11,7 +11,13 @@ from reference.recordings import made_by_hand, recorded_cars
 from reference.worlds import vehicles
 
 from ganlane.config.run import run_command
-from ganlane.generator import human_estimator, human_fit, human_tuning, load_human
+from ganlane.generator import (
+    human_estimator,
+    human_fit,
+    human_tuning,
+    load_human,
+    shipped_generator,
+)
 from ganlane.generator.human import (
     ACROSS,
     ALONG,
@@ -28,6 +34,7 @@ from ganlane.generator.human import (
     velocity,
     with_choice,
 )
+from ganlane.generator.human_estimator import other_noise
 from ganlane.generator.human_fit import (
     fit_human,
     fit_steps,
@@ -239,6 +246,17 @@ def test_accidents_the_edge_and_standing_cost():
     assert cost > 3.0
     cost, _ = costs(scene({"speed": 1.0}), ROAD, free[:, :1])
     assert cost > 0.3
+
+
+def test_the_noise_of_a_sensor_that_nobody_knows_is_not_taken_for_braking():
+    """At 25 m/s; to those that had seen one camera alone it was 24 m/s2 at worst."""
+    steady = torch.zeros(500, 9, 2)
+    steady[..., 0] = 2.5 * torch.arange(9.0)
+    noise = other_noise(500, 9, torch.Generator().manual_seed(0))
+    model, _ = load_human(shipped_generator("human"))
+    speed, acceleration = model.estimator(steady + noise)[..., :2].unbind(-1)
+    assert (speed - 25.0).abs().median() < 0.5
+    assert acceleration.abs().max() < 2.0
 
 
 def test_traffic_that_is_faster_keeps_its_gaps_and_accelerations():

@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
@@ -36,16 +35,17 @@ from ganlane.realism.driving import StartOptions, drive_recordings
 from ganlane.sim.random import Stream
 from ganlane.traffic.presets import gan_calibrated_traffic
 from ganlane.view.curves import plot_middle, read_metrics
-from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, palette, save_figure
+from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, save_figure
 
 DOCS = ROOT / "docs"
 FOLDER = DOCS / "figures"
+#: On which the networks are run, to see their shapes.
+VEHICLES = 9
 #: A scene that the generator was not fitted to, and the lane that is drawn; 0 is the rightmost.
 SCENE, LANE = "us101-b", 2
 
 
-@dataclass(frozen=True)
-class Block:
+class Block(NamedTuple):
     """A part of a network.
 
     Its name, what it does, the shape of its output, and its number of weights.
@@ -54,7 +54,7 @@ class Block:
     title: str
     does: str
     shape: tuple[int, ...]
-    parameters: int = 0
+    parameters: int
 
 
 def _block(title: str, does: str, output: Tensor, *modules: nn.Module) -> Block:
@@ -77,20 +77,18 @@ def _encoder_blocks(encoder: MotionLSTM, projections: tuple[Tensor, ...]) -> lis
 
 
 @torch.no_grad()
-def generator_blocks(generator: Generator, vehicles: int = 9) -> list[Block]:
-    """The generator's parts in order, run on ``vehicles`` vehicles to see the shapes (batch left
+def generator_blocks(generator: Generator) -> list[Block]:
+    """The parts of the paper's generator in order, with the shapes of their outputs (batch left
     out).
     """
     sizes = generator.sizes
-    observed = torch.zeros(1, vehicles, sizes.observed, 2)
-    seen = generator.observe(observed, observed[:, :, 0], torch.ones(1, vehicles, dtype=torch.bool))
-    seen = seen._replace(extra=torch.zeros(1, vehicles, sizes.extra_inputs))
+    observed = torch.zeros(1, VEHICLES, sizes.observed, 2)
+    seen = generator.observe(observed, observed[:, :, 0], torch.ones(1, VEHICLES, dtype=torch.bool))
     hidden = generator.encoder.encode(seen.projections)
     pooled = generator.pooling(hidden, seen.position, seen.displacement, seen.valid)
-    noise = torch.zeros(1, vehicles, sizes.noise)
+    noise = torch.zeros(1, VEHICLES, sizes.noise)
     outputs = generator(seen, noise)
     decoder, pooling = generator.decoder, generator.pooling
-    extra = f", {sizes.extra_inputs} further inputs" if sizes.extra_inputs else ""
     return [
         _block("observed displacements", "of every vehicle, m per 0.1 s", observed),
         *_encoder_blocks(generator.encoder, seen.projections),
@@ -103,7 +101,7 @@ def generator_blocks(generator: Generator, vehicles: int = 9) -> list[Block]:
         ),
         _block(
             "context",
-            f"of state and pooled neighbours{extra}",
+            "of state and pooled neighbours",
             generator.summarise(seen),
             generator.context,
         ),
@@ -124,11 +122,9 @@ def generator_blocks(generator: Generator, vehicles: int = 9) -> list[Block]:
 
 
 @torch.no_grad()
-def discriminator_blocks(
-    discriminator: Discriminator, steps: int, vehicles: int = 9
-) -> list[Block]:
-    """The discriminator's parts, run on ``steps`` displacements of ``vehicles`` vehicles."""
-    shown = torch.zeros(1, vehicles, steps, 2)
+def discriminator_blocks(discriminator: Discriminator, steps: int) -> list[Block]:
+    """The discriminator's parts, run on ``steps`` displacements."""
+    shown = torch.zeros(1, VEHICLES, steps, 2)
     encoder = discriminator.encoder
     return [
         _block("displacements", "observed, then recorded or predicted", shown),
@@ -146,29 +142,6 @@ def table_of(title: str, blocks: Sequence[Block]) -> Table:
     return Table(title, ["part", "what it does", "its output", "weights"], lines, names=2)
 
 
-@rc_context(STYLE)
-def draw_space_time(courses: Mapping[str, pl.DataFrame]) -> Figure:
-    """Positions over time of the vehicles in :data:`LANE`, the first of ``courses`` in black and
-    the others dashed over it.
-
-    Args:
-        courses: name to trajectories (:func:`ganlane.data.dense.Recording.frame`) of
-            :data:`SCENE`.
-    """
-    first, *others = courses
-    colours = {first: INK, **palette(others)}
-    figure = Figure(figsize=(7.5, 4.3))
-    axes = figure.subplots()
-    axes.set(title=f"{SCENE}, lane {LANE}", xlabel="time, s", ylabel="position, m")
-    for name, frame in courses.items():
-        style = "-" if name == first else "--"
-        for track in frame.partition_by("vehicle", maintain_order=True):
-            if track["lane"][0] == LANE:
-                axes.plot(track["frame"] * FRAME_S, track["x"], style, color=colours[name])
-    add_legend(figure, colours)
-    return figure
-
-
 def architecture() -> str:
     """Both networks of the paper's preset, as tables."""
     generator, metadata = load_generator(shipped_generator("paper"), "paper")
@@ -181,29 +154,36 @@ def architecture() -> str:
     return "\n\n".join(markdown(table_of(*network)) for network in networks.items())
 
 
+@rc_context(STYLE)
 def courses() -> Figure:
-    """The vehicles of one lane as recorded, and as the calibrated traffic drives them from the same
-    start.
+    """Positions over time of the vehicles in :data:`LANE`: as recorded in black, and, dashed over
+    it, as the calibrated traffic drives them from the same start.
     """
     frame = read_scenes(default_scenes()).filter(pl.col("scene") == SCENE)
     (recording,) = recordings_of(frame)
     make = partial(gan_calibrated_traffic, stream=Stream.REPORT)
     (driven,) = drive_recordings(make, [recording], StartOptions(desired_above_mps=11.0))
-    return draw_space_time({"recorded": recording.frame(), "gan_calibrated": driven.frame()})
+    figure = Figure(figsize=(7.5, 4.3))
+    axes = figure.subplots()
+    axes.set(title=f"{SCENE}, lane {LANE}", xlabel="time, s", ylabel="position, m")
+    colours = {"recorded": INK, "gan_calibrated": COLOURS[0]}
+    for course, style, colour in zip((recording, driven), ("-", "--"), colours.values()):
+        for track in course.frame().partition_by("vehicle", maintain_order=True):
+            if track["lane"][0] == LANE:
+                axes.plot(track["frame"] * FRAME_S, track["x"], style, color=colour)
+    add_legend(figure, colours)
+    return figure
 
 
-def read_curves(folders: Sequence[Path]) -> pl.DataFrame:
-    """The evaluations of training runs with two phases.
+def read_curves() -> pl.DataFrame:
+    """The evaluations of the committed training runs, which have two phases.
 
     Returns:
         Columns ``run``, ``decisions`` (over both phases), ``mean_reward`` and ``phase`` (``first``
         or ``second``).
-
-    Raises:
-        UserError: a folder without evaluations of both phases.
     """
     parts = []
-    for folder in folders:
+    for folder in sorted((DOCS / "learning_curves").glob("seed_*")):
         before = 0
         for phase, path in (("first", folder / "pretrain"), ("second", folder)):
             curve = read_metrics(path / "evaluation.csv")
@@ -215,11 +195,14 @@ def read_curves(folders: Sequence[Path]) -> pl.DataFrame:
 
 
 @rc_context(STYLE)
-def draw_transfer(curves: pl.DataFrame, before: Sequence[float]) -> Figure:
-    """Every run of :func:`read_curves`, their median, and the range between them.
+def transfer() -> Figure:
+    """Figure 4: every run of :func:`read_curves`, their median, and the range between them.
 
-    The crosses are ``before``: rewards on the new traffic before any training there.
+    The crosses are rewards on the new traffic before any training there.
     """
+    row = printed.at(printed.load(), "agent_idm+none", "gan")
+    before = [training["mean_reward"] for training in row["each"]]
+    curves = read_curves()
     figure = Figure(figsize=(7.0, 3.4))
     axes = figure.subplots()
     axes.set(title="evaluations during training", xlabel="decisions", ylabel="mean reward")
@@ -231,20 +214,12 @@ def draw_transfer(curves: pl.DataFrame, before: Sequence[float]) -> Figure:
         for run in points:
             axes.plot(*run, color=colour, lw=0.5, alpha=0.6)
     # Where the second phase begins.
-    switch = curves.filter(pl.col("phase") == "first")["decisions"].to_numpy().max()
+    switch = curves.filter(phase="first")["decisions"].to_numpy().max()
     axes.axvline(switch, color=FAINT, ls=":")
     axes.plot([switch] * len(before), before, "x", color=COLOURS[1])
     names = ("on idm_mobil", "on gan (x: before any training there)")
     add_legend(figure, dict(zip(names, COLOURS)))
     return figure
-
-
-def transfer() -> Figure:
-    """Figure 4."""
-    row = printed.at(printed.load(), "agent_idm+none", "gan")
-    before = [training["mean_reward"] for training in row["each"]]
-    curves = read_curves(sorted((DOCS / "learning_curves").glob("seed_*")))
-    return draw_transfer(curves, before)
 
 
 def draw(options: argparse.Namespace) -> str:

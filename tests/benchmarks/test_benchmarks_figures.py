@@ -3,27 +3,22 @@
 Shapes and weights are those of the loaded networks, courses those of the vehicles.
 """
 
-import pytest
-
-from benchmarks.figures import generator_blocks, transfer
+from benchmarks.figures import VEHICLES, generator_blocks, transfer
 from ganlane.generator import load_generator, shipped_generator
 from ganlane.view.figures import save_figure
 
 
-@pytest.mark.parametrize("preset", ["paper", "calibrated"])
-def test_the_architecture_shows_every_weight_and_the_shapes_of_the_loaded_generator(preset):
-    generator, _ = load_generator(shipped_generator(preset), preset)
-    sizes, blocks = (
-        generator.sizes,
-        {block.title: block for block in generator_blocks(generator, vehicles=5)},
-    )
+def test_the_architecture_shows_every_weight_and_the_shapes_of_the_loaded_generator():
+    generator, _ = load_generator(shipped_generator("paper"), "paper")
+    sizes = generator.sizes
+    blocks = {block.title: block for block in generator_blocks(generator)}
     assert sum(block.parameters for block in blocks.values()) == sum(
         p.numel() for p in generator.parameters()
     )
-    assert blocks["observed displacements"].shape == (5, sizes.observed, 2)
-    assert blocks["embedding"].shape == (5, sizes.observed - 1, 4 * sizes.hidden)
-    assert blocks["context"].shape == (5, sizes.hidden - sizes.noise)
-    assert blocks["predicted displacements"].shape == (5, sizes.predicted, 2)
+    assert blocks["observed displacements"].shape == (VEHICLES, sizes.observed, 2)
+    assert blocks["embedding"].shape == (VEHICLES, sizes.observed - 1, 4 * sizes.hidden)
+    assert blocks["context"].shape == (VEHICLES, sizes.hidden - sizes.noise)
+    assert blocks["predicted displacements"].shape == (VEHICLES, sizes.predicted, 2)
 
 
 def test_the_transfer_is_drawn_from_the_committed_curves(tmp_path):

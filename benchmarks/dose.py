@@ -59,8 +59,6 @@ HELD_OUT = ("idm_faults", "idm_random", "gan_calibrated")
 MET = ("idm_mobil", "human", "gan")
 EPISODES = 300
 MOST_SEEDS = 10
-#: The second per 1000 episodes.
-SCORES = ("reward", "failures")
 DECISIONS = 1_500_000
 ROWS = 256
 #: Of the two tables in a document.
@@ -157,11 +155,11 @@ def scores(
         if path.is_file():
             table = pl.read_parquet(path).filter(pl.col("traffic").is_in(traffics))
             table = table.sort("traffic", "episode")
-            rewards.append(table["reward"].to_numpy())
-            failures.append(1000.0 * table["failed"].to_numpy())
+            rewards.append(table["reward"])
+            failures.append(1000.0 * table["failed"])
     if not rewards:
         return {}
-    return {"reward": np.array(rewards), "failures": np.array(failures, np.float64)}
+    return {"reward": np.stack(rewards), "failures": np.stack(failures)}
 
 
 class Effect(NamedTuple):
@@ -169,7 +167,7 @@ class Effect(NamedTuple):
 
     training: Training
     seeds: int
-    scores: dict[str, Estimate]  # by :data:`SCORES`
+    scores: dict[str, Estimate]  # reward, and failures per 1000 episodes
 
 
 def effects(folder: Path) -> Iterator[Effect]:
@@ -178,17 +176,17 @@ def effects(folder: Path) -> Iterator[Effect]:
     Raises:
         UserError: there are no trainings among unchanged drivers to compare with.
     """
-    baseline = scores(folder, Training())
+    unchanged, *doses = trainings(1)
+    baseline = scores(folder, unchanged)
     if not baseline:
         raise UserError(f"--folder {folder}: no finished trainings; run 'train' first.")
     means = {name: Estimate(float(values.mean())) for name, values in baseline.items()}
-    yield Effect(Training(), len(baseline["reward"]), means)
-    for name, doses in DOSES.items():
-        for dose in doses:
-            changed = scores(folder, Training(name, dose))
-            if changed:
-                changes = {score: difference(changed[score], baseline[score]) for score in SCORES}
-                yield Effect(Training(name, dose), len(changed["reward"]), changes)
+    yield Effect(unchanged, len(baseline["reward"]), means)
+    for training in doses:
+        changed = scores(folder, training)
+        if changed:
+            changes = {name: difference(changed[name], baseline[name]) for name in changed}
+            yield Effect(training, len(changed["reward"]), changes)
 
 
 def dose_table(folder: Path) -> Table:
@@ -210,9 +208,9 @@ def transfer_table(folder: Path) -> Table:
     traffic; italics: met in training.
     """
     rows = []
-    unchanged = Training()
+    unchanged, *others = trainings(1, ["traffic"])
     baseline = {name: scores(folder, unchanged, [name]) for name in unchanged.driven()}
-    for training in (unchanged, *(Training("traffic", name) for name in DOSES["traffic"])):
+    for training in (unchanged, *others):
         cells = []
         seeds = 0
         for traffic in training.driven():
@@ -238,8 +236,8 @@ def draw_effects(changes: Sequence[Effect]) -> Figure:
     panels = figure.subplots(2, -(-len(DOSES) // 2), sharey=True).ravel()
     for panel, (name, doses) in zip(panels, DOSES.items()):
         panel.axhline(0.0, color=FAINT, ls=":")
-        panel.set(title=name, xticks=range(len(doses)), xticklabels=[str(dose) for dose in doses])
-        panel.set_xlim(-0.5, len(doses) - 0.5)
+        panel.set_xticks(range(len(doses)), map(str, doses))
+        panel.set(title=name, xlim=(-0.5, len(doses) - 0.5))
         for effect in changes:
             varied, dose, _ = effect.training
             reward = effect.scores["reward"]

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from ganlane.errors import UserError
@@ -47,11 +48,9 @@ def significant(value: float | None) -> str:
     """Three significant digits, without exponent."""
     if value is None:
         return "-"
-    # Rounded first: 9.996 has three digits as 10.0, not as 10.00.
-    rounded = float(f"{value:.3g}")
-    # Digits before the point; below 1 the format counts them itself.
-    whole = len(str(int(abs(rounded))))
-    return f"{rounded:.{max(0, 3 - whole)}f}" if abs(rounded) >= 1 else f"{rounded:.3g}"
+    shown = np.format_float_positional(value, 3, unique=False, fractional=False)
+    # Of 612 it leaves the point.
+    return shown.rstrip(".")
 
 
 def count(value: float) -> str:

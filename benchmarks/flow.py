@@ -132,11 +132,11 @@ def measure(
     return passed
 
 
-def largest_flow(idm: IdmParameters, desired_mps: float, length_m: float = 4.5) -> float:
-    """Of a platoon in equilibrium, veh/h per lane."""
+def largest_flow(idm: IdmParameters, desired_mps: float) -> float:
+    """Of a platoon in equilibrium, veh/h per lane; vehicles are 4.5 m long."""
     speed = desired_mps * np.arange(1, 1000) / 1000
     gap = (idm.min_gap_m + speed * idm.headway_s) / np.sqrt(1.0 - (speed / desired_mps) ** 4)
-    return float((3600.0 * speed / (gap + length_m)).max())
+    return float((3600.0 * speed / (gap + 4.5)).max())
 
 
 def table_of(results: list[Passed]) -> Table:

@@ -86,7 +86,7 @@ def table(document: str) -> str:
     driven = [entry for content in results for entry in content["entries"]]
     entries: dict[str, Results] = {}
     for entry in sorted(driven, key=lambda entry: -entry["trainings"]):
-        entries.setdefault(entry["entry"], {**entry, "decisions_per_s": None})
+        entries.setdefault(entry["entry"], entry)
     traffics = list(settings("benchmark", []).suite.scored)
     whole = score_table(list(entries.values()), traffics, [])
     # How fast one machine drove is no property of an agent.
@@ -111,20 +111,15 @@ def add(path: Path, name: str) -> str:
             f"{path}: not the results.json of ganlane benchmark ({error!r}); give that of a run."
         ) from error
     for number, agent in enumerate(agents):
-        if Path(agent).is_dir() and any(Path(agent).glob("*.zip")):
-            agents[number] = add_weights(Path(agent))
+        folder = Path(agent).resolve()
+        for model_file in sorted(folder.glob("*.zip")):
+            # The layers that act, without critics and optimisers.
+            model, reading = load_model(model_file)
+            save_network(FOLDER / folder.name / model_file.name, model.layers, reading)
+            agents[number] = folder.name
     file = FOLDER / f"{name}.json"
     write_json(file, {"agents": agents, **parts})
     return f"stored: {file}"
-
-
-def add_weights(folder: Path) -> str:
-    """Store the layers that act, without critics and optimisers; the name of their folder."""
-    name = folder.resolve().name
-    for file in sorted(folder.glob("*.zip")):
-        model, reading = load_model(file)
-        save_network(FOLDER / name / file.name, model.layers, reading)
-    return name
 
 
 def differences() -> list[str]:
@@ -177,13 +172,14 @@ def driven_again(name: str, results: Results, rewards: Rewards, every: bool = Fa
     wrong = []
     for driver, traffic in cells(results, every):
         before = results["sample"].get(driver.name, {}).get(traffic, [])
+        if not every:
+            before = before[:EPISODES]
         if not before:
             wrong.append(f"{name}: {driver.name} on {traffic} has no sample")
             continue
-        count = len(before) if every else min(EPISODES, len(before))
         cell = driver.name, traffic
-        if len(rewards.get(cell, [])) < count:
-            alone = replace(config.on(traffic), episodes=count)
+        if len(rewards.get(cell, [])) < len(before):
+            alone = replace(config.on(traffic), episodes=len(before))
             rewards[cell] = compare([driver], alone, quiet=True)["reward"].to_list()
         for number, (now, then) in enumerate(zip(rewards[cell], before)):
             if now != then:

@@ -109,14 +109,10 @@ def compare(before: dict[str, str], after: dict[str, str]) -> str:
     Raises:
         UserError: something does.
     """
-    lines = []
-    for name in dict.fromkeys([*before, *after]):
-        if name not in after:
-            lines.append([name, "gone"])
-        elif name not in before:
-            lines.append([name, "new"])
-        elif before[name] != after[name]:
-            lines.append([name, "differs"])
+    lines = [[name, "gone"] for name in before if name not in after]
+    for name, value in after.items():
+        if before.get(name) != value:
+            lines.append([name, "differs" if name in before else "new"])
     if lines:
         table = Table("", ["what", "verdict"], lines, names=2)
         raise UserError(f"{len(lines)} of {len(after)} digests are others:\n{table.text()}")

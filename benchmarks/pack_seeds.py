@@ -15,22 +15,20 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
 from benchmarks.script import make_parser, run_script
-from ganlane.agents import NetworkConfig, read_agent
+from ganlane.agents import read_agent
 from ganlane.agents.checkpoint import SEVERAL, with_seeds
 from ganlane.errors import UserError
 from ganlane.weights import save_weights
 
-#: Weights, network and metadata.
-Agent = tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]
+#: Weights and metadata.
+Agent = tuple[dict[str, Tensor], dict[str, Any]]
 
-AGENT_FILE = "agent.safetensors"
 #: Largest file that is written.
 MOST_BYTES = 5_000_000
 #: What agents of one recipe have in common; of the environment all but what has no effect on the
@@ -49,26 +47,12 @@ RECIPE = (
 WITHOUT_EFFECT = ("compile", "kernel")
 
 
-def tensors_of(agents: Mapping[int, Agent]) -> dict[str, Tensor]:
-    """The weights of several trainings; the names of each begin with its seed.
-
-    ``agents`` holds by seed what :func:`read_agent` gives. The scales of the noise are kept in half
-    precision, everything that a greedy agent computes with as it is.
-    """
-    return {
-        f"{seed}/{name}": value.half() if name.endswith("_sigma") else value
-        for seed, (weights, _, _) in agents.items()
-        for name, value in weights.items()
-    }
-
-
 def recipe_of(metadata: Mapping[str, Any]) -> dict[str, Any]:
     """What a training was, without its seed and its results."""
     shared = {name: metadata.get(name) for name in RECIPE}
-    env = shared["env"]
-    if isinstance(env, dict):
-        shared["env"] = {key: value for key, value in env.items() if key not in WITHOUT_EFFECT}
-    training = metadata.get("training", {})
+    env = metadata.get("env", {})
+    shared["env"] = {key: value for key, value in env.items() if key not in WITHOUT_EFFECT}
+    training = metadata["training"]
     return shared | {name: training.get(name) for name in ("phase", "traffic")}
 
 
@@ -92,14 +76,10 @@ def collect(folders: Sequence[str | Path]) -> dict[int, Agent]:
     recipes: dict[str, dict[str, Any]] = {}
     for path in (name for folder in folders for name in with_seeds(str(folder))):
         if Path(path).is_dir():
-            path = f"{path}/{AGENT_FILE}"
-            if not Path(path).is_file():
-                raise UserError(
-                    f"{path}: no such file; give the folder of a finished training, which has one."
-                )
-        agent = read_agent(path)
-        metadata = {**agent[2], "network": asdict(agent[1])}
-        seed = metadata.get("training", {}).get("seed")
+            path = f"{path}/agent.safetensors"
+        weights, _, metadata = read_agent(path)
+        training = metadata.get("training", {})
+        seed = training.get("seed")
         if not isinstance(seed, int):
             raise UserError(
                 f"{path}: its metadata name no seed; give an agent that 'ganlane train' wrote."
@@ -114,17 +94,25 @@ def collect(folders: Sequence[str | Path]) -> dict[int, Agent]:
                 f"{path}: another recipe than {first} ({', '.join(differing)}); "
                 "give runs of one recipe."
             )
-        agent[2]["training"]["init"] = of_no_machine(metadata["training"].get("init"))
-        agents[seed] = agent
+        training["init"] = of_no_machine(training.get("init"))
+        agents[seed] = weights, metadata
     return dict(sorted(agents.items()))
 
 
 def pack(options: argparse.Namespace) -> str:
-    """Write the agents into one file, ``FILE@SEED`` for each; the line that names it."""
+    """Write the agents into one file, ``FILE@SEED`` for each; the line that names it.
+
+    Names of weights begin with the agent's seed. The scales of the noise are kept in half
+    precision, everything that a greedy agent computes with as it is.
+    """
     if options.out.suffix != ".safetensors":
         raise UserError(f"--out {options.out}: the name must end in .safetensors.")
     agents = collect(options.folders)
-    tensors = tensors_of(agents)
+    tensors = {
+        f"{seed}/{name}": value.half() if name.endswith("_sigma") else value
+        for seed, (weights, _) in agents.items()
+        for name, value in weights.items()
+    }
     size = sum(value.nbytes for value in tensors.values())
     if size > MOST_BYTES:
         raise UserError(
@@ -132,10 +120,7 @@ def pack(options: argparse.Namespace) -> str:
             "give fewer runs."
         )
     # each agent's metadata by its seed, as text: JSON has no other keys
-    described = {
-        str(seed): {**metadata, "network": network.description()}
-        for seed, (_, network, metadata) in agents.items()
-    }
+    described = {str(seed): metadata for seed, (_, metadata) in agents.items()}
     save_weights(options.out, SEVERAL, tensors, {"agents": described})
     return f"{options.out}: seeds {', '.join(map(str, agents))}; {size / 1e6:.1f} MB"
 

@@ -104,7 +104,7 @@ def test_a_seed_that_is_not_there_or_not_named_ends_in_a_sentence(
         (r"\(env\)", {"env": {"lanes": 4}}),
         ("another run has seed 1", {"seed": 1}),
         ("name no seed", {"training": {}}),
-        ("no such file; give the folder", None),
+        ("no such file", None),
     ],
 )
 def test_only_runs_of_one_recipe_and_different_seeds_are_packed(told, more, tmp_path):

@@ -17,17 +17,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from benchmarks.peers.report import PARTS, draw
 from benchmarks.peers.scene import (
-    LAW,
     OBSTACLE,
     SCENES,
     SETTLED_MPS,
     SLOW_AND_GO,
-    Law,
     Scene,
     Scheme,
     Trace,
@@ -36,6 +33,7 @@ from benchmarks.peers.scene import (
     settling,
 )
 from benchmarks.peers.simulators import (
+    OURS,
     PEERS,
     Peer,
     drive_highway_env,
@@ -75,18 +73,18 @@ def take_apart(scene: Scene, peer: Peer, ganlane: Trace, driven: Trace) -> Apart
     )
 
 
-def settled(speed_mps: float, drive: Callable[[Scene], Trace], law: Law) -> dict[str, float]:
+def settled(speed_mps: float, simulator: Peer) -> dict[str, float]:
     """The last gaps of a platoon.
 
     Their mean, how far one is from the formula of its law, and how far it may be.
     """
-    trace = drive(settling(speed_mps))
-    expected = equilibrium_gap(speed_mps, law)
+    trace = simulator.drive(settling(speed_mps))
+    expected = equilibrium_gap(speed_mps, simulator.law)
     return {
         "gap_m": float(trace.gap[-1].mean()),
         "formula_m": expected,
         "away_m": largest(trace.gap[-1] - expected),
-        "allowed_m": unsettled_gap_m(trace, law),
+        "allowed_m": unsettled_gap_m(trace, simulator.law),
     }
 
 
@@ -94,21 +92,21 @@ def collect() -> tuple[dict[str, Any], dict[str, dict[str, Trace]]]:
     """All figures, and the traces by scene and simulator."""
     traces: dict[str, dict[str, Trace]] = {}
     rows: list[dict[str, Any]] = []
+    simulators = (OURS, *PEERS)
     for scene in SCENES:
-        mine = drive_ours(scene)
-        traces[scene.name] = {"ganlane": mine, **{peer.name: peer.drive(scene) for peer in PEERS}}
+        driven = {simulator.name: simulator.drive(scene) for simulator in simulators}
+        traces[scene.name] = driven
         for peer in PEERS:
-            apart = take_apart(scene, peer, mine, traces[scene.name][peer.name])._asdict()
+            apart = take_apart(scene, peer, driven[OURS.name], driven[peer.name])._asdict()
             pieces = {name: piece._asdict() for name, piece in apart.items()}
             rows.append({"scene": scene.name, "peer": peer.name, **pieces})
-    drivers = [("ganlane", drive_ours, LAW), *((peer.name, peer.drive, peer.law) for peer in PEERS)]
     figures = {
         "versions": versions(),
         "traces": rows,
         "settled": [
-            {"speed_mps": speed, "simulator": name, **settled(speed, drive, law)}
+            {"speed_mps": speed, "simulator": simulator.name, **settled(speed, simulator)}
             for speed in SETTLED_MPS
-            for name, drive, law in drivers
+            for simulator in simulators
         ],
         "stops": [
             {

@@ -59,8 +59,10 @@ class Scene:
         """Number of physics steps of ``dt`` seconds."""
         return round(self.seconds / dt)
 
-    def leader_speeds(self, dt: float = PHYSICS_STEP_S) -> Array:
-        """The leader's speed at every step, m/s, [steps + 1]."""
+    def leader_speeds(self, dt: float = PHYSICS_STEP_S) -> Array | None:
+        """The leader's speed at every step, m/s, [steps + 1]; None where it drives freely."""
+        if not self.leader:
+            return None
         times, speeds = zip(*self.leader)
         return np.interp(np.arange(self.steps(dt) + 1) * dt, times, speeds)
 
@@ -177,7 +179,7 @@ def ahead(trace: Trace, law: Law = LAW) -> tuple[Array, Array]:
 
 def integrate(scene: Scene, scheme: Scheme, law: Law = LAW, dt: float = PHYSICS_STEP_S) -> Trace:
     """Drive ``scene`` with ``law`` and ``scheme`` at steps of ``dt`` seconds."""
-    leader = scene.leader_speeds(dt) if scene.leader else None
+    leader = scene.leader_speeds(dt)
     speeds, positions = [np.array(scene.speeds_mps)], [scene.positions_m()]
     for step in range(scene.steps(dt)):
         speed, position = speeds[-1], positions[-1]

@@ -30,6 +30,7 @@ import math
 import platform
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,7 +39,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from benchmarks.peers.scene import DESIRED_SPEED_MPS, LENGTH_M, ROAD_M, Law, Scene, Scheme, Trace
+from benchmarks.peers.scene import (
+    DESIRED_SPEED_MPS,
+    LAW,
+    LENGTH_M,
+    ROAD_M,
+    Law,
+    Scene,
+    Scheme,
+    Trace,
+)
 from ganlane._version import __version__
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
@@ -71,10 +81,10 @@ def led(before: Vehicles, moved: Vehicles, leader_mps: float) -> Vehicles:
     """``moved`` with the foremost at its prescribed speed, at constant acceleration within the
     step.
     """
-    speed, x = moved.speed.clone(), moved.x.clone()
-    speed[:, 0] = leader_mps
-    x[:, 0] = before.x[:, 0] + 0.5 * PHYSICS_STEP_S * (before.speed[:, 0] + leader_mps)
-    return moved.with_(speed=speed, x=x)
+    first = before.at(0)
+    x = first.x + 0.5 * PHYSICS_STEP_S * (first.speed + leader_mps)
+    leader = moved.at(0).with_(speed=torch.full_like(x, leader_mps), x=x)
+    return moved.with_first(leader)
 
 
 def drive_ours(scene: Scene) -> Trace:
@@ -84,10 +94,11 @@ def drive_ours(scene: Scene) -> Trace:
     key = torch.zeros(1, dtype=torch.int64)
     memory = traffic.fresh_memory(vehicles, key)
     driven = [vehicles]
+    leader = scene.leader_speeds()
     for step in range(scene.steps()):
         moved, memory = traffic.move(vehicles, memory, key, key + step)
-        if scene.leader:
-            moved = led(vehicles, moved, scene.leader_speeds()[step + 1])
+        if leader is not None:
+            moved = led(vehicles, moved, leader[step + 1])
         vehicles = moved
         driven.append(vehicles)
     speeds, positions = (
@@ -145,7 +156,7 @@ def drive_highway_env(scene: Scene, offset_m: float = 0.0, dt: float = PHYSICS_S
     length of a vehicle for HighwayEnv as it comes. Positions in the trace are the bodies' centres.
     """
     road = highway_env_road(scene, offset_m)
-    leader = scene.leader_speeds(dt) if scene.leader else None
+    leader = scene.leader_speeds(dt)
     speeds, positions = [], []
     for step in range(scene.steps(dt) + 1):
         if step:
@@ -230,7 +241,7 @@ def _run_sumo(libsumo: Any, scene: Scene, dt: float) -> Trace:
 
     That is the start.
     """
-    leader = scene.leader_speeds(dt) if scene.leader else None
+    leader = scene.leader_speeds(dt)
     libsumo.simulationStep()
     names = [str(rank) for rank in range(len(scene.speeds_mps))]
     if sorted(libsumo.vehicle.getIDList()) != names:
@@ -251,7 +262,10 @@ def _run_sumo(libsumo: Any, scene: Scene, dt: float) -> Trace:
 
 
 class Peer(NamedTuple):
-    """A simulator as it is set up here: how it drives a scene, integrates, and reads IDM."""
+    """A simulator as it is set up here: how it drives a scene, integrates, and reads IDM.
+
+    ``module`` is imported for it.
+    """
 
     name: str
     module: str
@@ -260,6 +274,7 @@ class Peer(NamedTuple):
     law: Law
 
 
+OURS = Peer("ganlane", "ganlane", drive_ours, Scheme.BALLISTIC, LAW)
 #: HighwayEnv neither floors the desired gap nor the speed, and sees nobody on an empty road.
 _HIGHWAY_ENV = Law(floored=False, reverses=True, free_gap_m=math.inf)
 _SUMO = Law(free_gap_m=math.inf)
@@ -270,7 +285,7 @@ PEERS = (
         "highway_env",
         partial(drive_highway_env, offset_m=LENGTH_M),
         Scheme.EXPLICIT_EULER,
-        Law(LENGTH_M, floored=False, reverses=True, free_gap_m=math.inf),
+        replace(_HIGHWAY_ENV, offset_m=LENGTH_M),
     ),
     Peer("SUMO, ballistic", "libsumo", drive_sumo, Scheme.BALLISTIC, _SUMO),
     Peer(

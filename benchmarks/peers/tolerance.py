@@ -122,9 +122,8 @@ def tolerance(trace: Trace, scene: Scene, scheme: Scheme, law: Law = LAW) -> Lar
 
     :func:`difference`, margin and rounding.
     """
-    expected = difference(trace, scene, scheme, law)
-    gap = expected.position[:, :-1] - expected.position[:, 1:]
-    sizes = (largest(expected.speed), largest(gap), largest(expected.position))
+    nothing = np.zeros_like(trace.speed)
+    sizes = between(difference(trace, scene, scheme, law), Trace(nothing, nothing))
     return Largest(*(MARGIN * size + rest for size, rest in zip(sizes, ROUNDING)))
 
 

@@ -12,7 +12,7 @@ every traffic through gymnasium, with random actions and with an ego that keeps 
 goal, beside EnvPool and HighwayEnv; scenarios: merging and taking an exit, beside their versions of
 the same, an on-ramp beside SUMO's, each beside a highway with as many vehicles; traffic: every
 traffic model; train: the training loop, beside stable-baselines3's DQN on HighwayEnv. Peers are
-measured where they are installed.
+measured where they are installed. A report of a GPU is the section `bench SUITE cuda`.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import date
 from functools import partial
-from pathlib import Path
 
 from benchmarks.script import (
     ReportSection,
+    add_report,
     count,
     make_parser,
     markdown,
@@ -89,8 +89,8 @@ def cases_of(
     elif options.suite == "traffic":
         starts = {"ganlane traffic": systems.start_traffic}
     elif options.suite == "train":
-        agent = {"config": RainbowConfig(), "stored": options.stored}
-        starts = {"ganlane training": partial(systems.start_training, **agent)}
+        start = partial(systems.start_training, config=RainbowConfig(), stored=options.stored)
+        starts = {"ganlane training": start}
     else:
         start = partial(systems.start_gymnasium, keep=EGOS[ego])
         starts = {f"ganlane{_scene_and_ego(road, ego)}": start}
@@ -100,11 +100,10 @@ def cases_of(
             starts[name] = partial(systems.start_without_ends, start)
     cases = []
     for traffic, system, mode in itertools.product(options.traffics, starts, options.modes):
-        place = mode, options.device, batch
         labels = Labels(
             system, traffic, road.vehicles, road.lanes, mode, options.device, threads, batch
         )
-        start = partial(starts[system], replace(road, traffic=traffic), *place)
+        start = partial(starts[system], replace(road, traffic=traffic), mode, options.device, batch)
         cases.append(Case(labels, start, batch))
     return cases
 
@@ -170,8 +169,7 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
     for threads, batch, road, ego in groups:
         cases = cases_of(options, road, threads, batch, ego)
         peers = peers_of(options, road, threads, batch, ego)
-        first = peers[0] if peers else None
-        rows += measure([*peers[1:], *cases], first, options.repetitions, options.seconds)
+        rows += measure(peers, cases, options.repetitions, options.seconds)
         where = f"threads {threads}, batch {batch}{_scene_and_ego(road, ego)}"
         print(f"{where}: done", file=sys.stderr, flush=True)
     return rows
@@ -193,8 +191,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--quick", action="store_true", help="a check that it runs: small batches, short turns")
     add("--traffics", nargs="+", metavar="NAME", help="options of the group traffic")
     add("--batches", nargs="+", type=int, metavar="N", help="environments side by side")
-    modes = ("eager", "native")
-    add("--modes", nargs="+", choices=modes, default=["eager", "native"])
+    modes = ["eager", "native"]
+    add("--modes", nargs="+", choices=modes, default=modes)
     add("--threads", nargs="+", type=int, default=[1], metavar="N", help="of torch")
     add("--device", choices=("cpu", "cuda"), default="cpu")
     add("--vehicles", type=int, default=9, metavar="N", help="the ego included")
@@ -204,8 +202,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--repetitions", type=int, default=5, metavar="N", help="turns of every case")
     add("--seconds", type=float, default=0.5, help="a turn lasts about so long")
     add("--no-peers", action="store_true")
-    add("--report", type=Path, metavar="FILE",
-        help="a document with <!-- begin bench SUITE -->; on cuda, SUITE cuda")  # fmt: skip
+    add_report(parser, "bench SUITE")
     options = parser.parse_args(arguments)
     options.traffics = options.traffics or TRAFFICS[options.suite]
     if options.suite in THROUGH_GYMNASIUM:

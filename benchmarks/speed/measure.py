@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,10 +63,11 @@ class Sample(NamedTuple):
     physics_steps: int
 
     @property
-    def rates(self) -> tuple[float, float]:
-        """Physics steps per second of wall and of CPU time."""
+    def rates(self) -> tuple[float, float, float]:
+        """Decisions and physics steps per second of wall time, the latter also of CPU time."""
         # A coarse CPU clock may not have moved.
-        return self.physics_steps / self.wall_s, self.physics_steps / max(self.cpu_s, 1e-6)
+        per_cpu_s = self.physics_steps / max(self.cpu_s, 1e-6)
+        return self.decisions / self.wall_s, self.physics_steps / self.wall_s, per_cpu_s
 
 
 def take_turn(case: Case, run: Runner, calls: int) -> Sample:
@@ -94,14 +94,14 @@ def calls_per_turn(case: Case, run: Runner, seconds: float) -> int:
 
 
 def take_turns(
-    cases: Sequence[Case], runners: Sequence[Runner], repetitions: int, seconds: float
+    started: Sequence[tuple[Case, Runner]], repetitions: int, seconds: float
 ) -> list[list[Sample]]:
     """Samples of each case: ``repetitions`` turns of about ``seconds`` each, after a warm-up."""
-    calls = [calls_per_turn(case, run, seconds) for case, run in zip(cases, runners)]
-    samples: list[list[Sample]] = [[] for _ in cases]
+    calls = [calls_per_turn(case, run, seconds) for case, run in started]
+    samples: list[list[Sample]] = [[] for _ in started]
     for _ in range(repetitions):
-        for i, case in enumerate(cases):
-            samples[i].append(take_turn(case, runners[i], calls[i]))
+        for i, (case, run) in enumerate(started):
+            samples[i].append(take_turn(case, run, calls[i]))
     return samples
 
 
@@ -119,41 +119,41 @@ def make_row(labels: Labels, samples: Sequence[Sample], peer: Sequence[Sample] =
         ``ratio_cpu``: physics steps per second of wall and of CPU time over the peer's turn of the
         same round, median of the rounds, or None.
     """
-    per_s, per_cpu_s = np.median([sample.rates for sample in samples], axis=0).tolist()
-    walls_s = [sample.wall_s for sample in samples]
-    low, high = np.quantile(walls_s, [0.25, 0.75])
+    rates = [sample.rates for sample in samples]
+    decisions_per_s, per_s, per_cpu_s = np.median(rates, axis=0).tolist()
+    low, middle, high = np.quantile([sample.wall_s for sample in samples], [0.25, 0.5, 0.75])
     ratio = ratio_cpu = None
     if peer:
         # Within a round other work on the machine slows both alike.
-        rates, of_peer = ([sample.rates for sample in turns] for turns in (samples, peer))
-        ratio, ratio_cpu = np.median(np.divide(rates, of_peer), axis=0).tolist()
+        ratios = np.divide(rates, [sample.rates for sample in peer])
+        _, ratio, ratio_cpu = np.median(ratios, axis=0).tolist()
     return {
         **asdict(labels),
         "physics_steps_per_s": per_s,
-        "decisions_per_s": median(sample.decisions / sample.wall_s for sample in samples),
+        "decisions_per_s": decisions_per_s,
         "physics_steps_per_cpu_s": per_cpu_s,
-        "spread": float(high - low) / median(walls_s),
+        "spread": float((high - low) / middle),
         "ratio": ratio,
         "ratio_cpu": ratio_cpu,
     }
 
 
 def measure(
-    cases: Sequence[Case], peer: Case | None, repetitions: int, seconds: float
+    peers: Sequence[Case], cases: Sequence[Case], repetitions: int, seconds: float
 ) -> list[Row]:
-    """Rows of cases with the same number of threads that take turns; the ``peer``'s comes first."""
-    started: list[Case] = []
-    runners: list[Runner] = []
+    """Rows of peers and cases with the same number of threads that take turns; ratios are to the
+    first peer, if any.
+    """
+    started: list[tuple[Case, Runner]] = []
     torch.set_num_threads(cases[0].labels.threads)
-    for case in cases if peer is None else [peer, *cases]:
+    for case in (*peers, *cases):
         try:
-            runners.append(case.start())
-            started.append(case)
+            started.append((case, case.start()))
         except UserError as error:
             if case.labels.mode == "eager":
                 raise
             # No compiler here, or a traffic that the kernel does not drive.
             print(f"left out, {case.labels.mode}: {error}", file=sys.stderr)
-    samples = take_turns(started, runners, repetitions, seconds)
-    of_peer = samples[0] if peer is not None else []
-    return [make_row(case.labels, turns, of_peer) for case, turns in zip(started, samples)]
+    samples = take_turns(started, repetitions, seconds)
+    of_peer = samples[0] if peers else []
+    return [make_row(case.labels, turns, of_peer) for (case, _), turns in zip(started, samples)]

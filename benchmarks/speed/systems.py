@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from itertools import cycle
 from typing import Any
 
 import gymnasium
@@ -113,17 +114,15 @@ def _stepping(env: Any, actions: Tensor) -> Runner:
     are counted as simulated: an episode that ends within a decision is not simulated further, one
     that leaves the road not at all.
     """
-    drawn = actions.to(env.device).unbind(0)
+    drawn = cycle(actions.to(env.device).unbind(0))
     state = env.reset()
-    decision = 0
 
     def run(decisions: int) -> int:
-        nonlocal state, decision
+        nonlocal state
         simulated = torch.zeros((), dtype=torch.int64, device=env.device)
         with torch.inference_mode():
             for _ in range(decisions):
-                decision += 1
-                state.set(keys.ACTION, drawn[decision % len(drawn)])
+                state.set(keys.ACTION, next(drawn))
                 before, state = env.step_and_maybe_reset(state)
                 simulated += (before["next", keys.STEP] - before[keys.STEP]).sum()
         return int(simulated)
@@ -160,15 +159,14 @@ def start_gymnasium(road: Road, mode: str, device: str, batch: int, keep: bool =
     else:
         env = gymnasium.make_vec("ganlane/Highway-v0", batch, **chosen)
     env.reset()
+    drawn = cycle(actions)
     time_s: Any = 0.0
-    decision = 0
 
     def run(decisions: int) -> int:
-        nonlocal time_s, decision
+        nonlocal time_s
         driven_s = 0.0
         for _ in range(decisions):
-            decision += 1
-            action = actions[decision % DRAWN]
+            action = next(drawn)
             *_, terminated, truncated, info = env.step(int(action[0]) if batch == 1 else action)
             end_s = info["time_s"]
             if "_final_info" in info:  # of rows that were reset, the time at their ends

@@ -14,7 +14,6 @@ from benchmarks.peers.scene import (
     CONSTANT,
     DESIRED_SPEED_MPS,
     FREE_ROAD,
-    LAW,
     OBSTACLE,
     SCENES,
     SETTLED_MPS,
@@ -123,15 +122,11 @@ def test_the_scheme_and_the_reading_account_for_all_that_tells_a_peer_from_us(sc
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "peer", [None, *simulators.PEERS], ids=lambda peer: "ours" if peer is None else title(peer)
-)
+@pytest.mark.parametrize("peer", [simulators.OURS, *simulators.PEERS], ids=title)
 @pytest.mark.parametrize("speed_mps", SETTLED_MPS)
 def test_a_platoon_settles_at_the_equilibrium_gap(speed_mps, peer):
-    if peer is not None:
-        need(peer.module)
-    law = LAW if peer is None else peer.law
-    platoon = compare.settled(speed_mps, simulators.drive_ours if peer is None else peer.drive, law)
+    need(peer.module)
+    platoon = compare.settled(speed_mps, peer)
     assert platoon["away_m"] <= platoon["allowed_m"] <= 1e-5
-    if not law.offset_m:
+    if not peer.law.offset_m:
         assert platoon["gap_m"] == pytest.approx(equilibrium_gap(speed_mps), abs=1e-5)

@@ -40,7 +40,7 @@ def test_bare_physics_moves_every_environment_for_the_whole_decision(mode):
 @pytest.mark.parametrize("batch", [1, 8])
 def test_only_simulated_steps_count(start, batch):
     run = start(Road(), "native", "cpu", batch)
-    decisions = 25
+    decisions = 50
     # Whoever leaves the road, which a third of the random actions may do, is out at once.
     assert 0.4 * 10 * batch * decisions < run(decisions) < 10 * batch * decisions
 

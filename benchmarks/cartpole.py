@@ -17,7 +17,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import gymnasium
@@ -138,28 +138,23 @@ def run(seed: int) -> Outcome:
     return outcome
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
-    """All seeds and their median, as Markdown.
+def measure(options: argparse.Namespace) -> str:
+    """Run all seeds; the table, in the document too where one is named.
 
     A seed that did not reach the goal counts as never.
     """
+    section = ReportSection(options.report, SECTION)
+    outcomes = []
+    for seed in range(SEEDS):
+        outcomes.append(run(seed))
+        print("seed {}: 475 at {} frames, best {}, {}".format(*outcomes[-1].cells()), flush=True)
     median = statistics.median(outcome.reached for outcome in outcomes)
     lines = [
         *(outcome.cells() for outcome in outcomes),
         ["median", frames_text(median), "", ""],
     ]
     headings = ["seed", "frames to 475", "best mean return", "time"]
-    return markdown(Table("", headings, lines, 4))
-
-
-def measure(options: argparse.Namespace) -> str:
-    """Run all seeds; the table, in the document too where one is named."""
-    section = ReportSection(options.report, SECTION)
-    outcomes = []
-    for seed in range(SEEDS):
-        outcomes.append(run(seed))
-        print("seed {}: 475 at {} frames, best {}, {}".format(*outcomes[-1].cells()), flush=True)
-    text = table(outcomes)
+    text = markdown(Table("", headings, lines, 4))
     section.write(text)
     return text
 

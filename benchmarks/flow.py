@@ -40,6 +40,8 @@ TRAFFICS = ("idm_mobil", "idm_random")
 FROM_M = -1000.0
 TO_M = 1000.0
 SLOTS = 560
+#: Sections side by side.
+ROWS = 16
 #: Until the queue has formed, s.
 WARM_UP_S = 400
 STANDING_MPS = 0.1
@@ -87,16 +89,21 @@ def measure(
     traffic: str,
     vehicles: int,
     courtesy: float = MobilParameters.courtesy,
-    rows: int = 16,
 ) -> Passed:
-    """Until so many ``vehicles`` have left, in all ``rows`` together; ``courtesy`` in m/s2."""
+    """Until so many ``vehicles`` have left, in all :data:`ROWS` together; ``courtesy`` in m/s2."""
     exit_share = EXIT_SHARE if scene == "weave" else 0.0
-    flow = {"vph": VPH, "ramp_vph": RAMP_VPH, "exit_share": exit_share}
-    flow |= {"from_m": FROM_M, "to_m": TO_M, "slots": SLOTS}
+    flow = {
+        "vph": VPH,
+        "ramp_vph": RAMP_VPH,
+        "exit_share": exit_share,
+        "from_m": FROM_M,
+        "to_m": TO_M,
+        "slots": SLOTS,
+    }
     drivers = {"courtesy": courtesy}
     config = make(EnvConfig, {"name": scene, "flow": flow, "mobil": drivers, "timeout_s": 1e6})
     module = make_traffic(make(TrafficConfig, traffic), config)
-    env = make_env(module, DrivingConfig(env=config), rows)
+    env = make_env(module, DrivingConfig(env=config), ROWS)
     base = env.base_env
     road = base.road
     passed = Passed(scene, traffic, lanes=config.lanes - 1)
@@ -105,13 +112,13 @@ def measure(
     # Nobody meets the ego.
     state[keys.VEHICLES, "x"][:, keys.EGO_INDEX] = NOWHERE_M
     state[keys.VEHICLES, "valid"][:, keys.EGO_INDEX] = False
-    stood = torch.zeros(rows, base.vehicles, dtype=torch.int64)
+    stood = torch.zeros(ROWS, base.vehicles, dtype=torch.int64)
     second = 0
     # No more than six times as long as at 1000 veh/h/lane, in case nobody gets through.
-    most_s = WARM_UP_S + 6 * 3600 * vehicles // (1000 * passed.lanes * rows)
+    most_s = WARM_UP_S + 6 * 3600 * vehicles // (1000 * passed.lanes * ROWS)
     while passed.left < vehicles and second < most_s:
         before = state[keys.VEHICLES, "valid"]
-        state = base.step(state.set("action", torch.zeros(rows, dtype=torch.int64)))["next"]
+        state = base.step(state.set("action", torch.zeros(ROWS, dtype=torch.int64)))["next"]
         assert not state["done"].any()
         now = state[keys.VEHICLES]
         stands = now["valid"] & (now["speed"] < STANDING_MPS)
@@ -123,7 +130,7 @@ def measure(
         by_exit = torch.zeros_like(gone)
         if road.exit_lane is not None:
             by_exit = gone & (road.lane_of(now["y"]) == road.exit_lane)
-        passed.hours += rows / 3600.0
+        passed.hours += ROWS / 3600.0
         passed.by_exit += int(by_exit.sum())
         passed.downstream += int((gone & ~by_exit).sum())
         passed.missed += int((gone & ~by_exit & exits).sum())

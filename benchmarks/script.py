@@ -5,6 +5,7 @@ document that one writes, exit status.
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -102,13 +103,13 @@ class ReportSection:
                 f"{end} in it."
             )
         text = document.read_text(encoding="utf-8")
-        if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        parts = re.split(f"({begin}|{end})", text)
+        if parts[1::2] != [begin, end]:
             raise UserError(
                 f"report={document}: expected the lines {begin} and {end} in it, once each; add "
                 "them."
             )
-        before, _, rest = text.partition(begin)
-        between, _, after = rest.partition(end)
+        before, _, between, _, after = parts
         return before + begin, between, end + after
 
 

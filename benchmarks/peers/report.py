@@ -92,6 +92,7 @@ PARTS: dict[str, Callable[[Figures], str]] = {
 
 
 MARKERS = dict(zip(("SUMO, Euler", "HighwayEnv", "SUMO, ballistic"), zip("osx", COLOURS)))
+WITH_OURS = {"ganlane": ("D", INK), **MARKERS}
 SCHEMES = {"HighwayEnv": Scheme.EXPLICIT_EULER, "SUMO, Euler": Scheme.SEMI_IMPLICIT_EULER}
 
 
@@ -147,14 +148,14 @@ def _apart(axes: Axes, traces: dict[str, Trace]) -> None:
 def _gaps(axes: Axes, rows: list[dict[str, Any]]) -> None:
     speeds = np.linspace(0.0, 18.0, 100)
     axes.plot(speeds, [equilibrium_gap(v) for v in speeds], color=INK, label="$s_e(v)$")
-    for name, (marker, colour) in {"ganlane": ("D", INK), **MARKERS}.items():
+    for name, (marker, colour) in WITH_OURS.items():
         mine = [(row["speed_mps"], row["gap_m"]) for row in rows if row["simulator"] == name]
         axes.plot(*zip(*mine), marker, color=colour, fillstyle="none", label=name)
     _label(axes, "equilibrium gaps", "speed, m/s", "gap, m")
 
 
 def _stop(axes: Axes, traces: dict[str, Trace]) -> None:
-    for name, (_, colour) in {"ganlane": ("", INK), **MARKERS}.items():
+    for name, (_, colour) in WITH_OURS.items():
         style = "--" if name == "SUMO, ballistic" else "-"
         _plot(axes, traces[name].gap[:, 0], style, color=colour, label=name)
     axes.axhline(TABLE_V.min_gap_m, color="grey", lw=0.8)

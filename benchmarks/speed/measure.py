@@ -6,7 +6,6 @@ import math
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,8 +22,7 @@ Row = dict[str, Any]
 MOST_CALLS = 2**20
 
 
-@dataclass(frozen=True)
-class Labels:
+class Labels(NamedTuple):
     """What is measured: the first columns of a row.
 
     Attributes:
@@ -128,7 +126,7 @@ def make_row(labels: Labels, samples: Sequence[Sample], peer: Sequence[Sample] =
         ratios = np.divide(rates, [sample.rates for sample in peer])
         _, ratio, ratio_cpu = np.median(ratios, axis=0).tolist()
     return {
-        **asdict(labels),
+        **labels._asdict(),
         "physics_steps_per_s": per_s,
         "decisions_per_s": decisions_per_s,
         "physics_steps_per_cpu_s": per_cpu_s,

@@ -272,9 +272,8 @@ def start_highway(road: Road, keep: bool = False) -> Runner:
     random = np.random.default_rng(SEED)
 
     def run(decisions: int) -> int:
-        drawn = random.integers(env.action_space.n, size=decisions)
-        for action in np.full_like(drawn, THEIR_KEEP) if keep else drawn:
-            _, _, terminated, truncated, _ = env.step(int(action))
+        for action in random.integers(env.action_space.n, size=decisions).tolist():
+            _, _, terminated, truncated, _ = env.step(THEIR_KEEP if keep else action)
             if terminated or truncated:
                 env.reset()
         return decisions * STEPS

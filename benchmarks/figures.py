@@ -179,16 +179,16 @@ def read_curves() -> pl.DataFrame:
     """The evaluations of the committed training runs, which have two phases.
 
     Returns:
-        Columns ``run``, ``decisions`` (over both phases), ``mean_reward`` and ``phase`` (``first``
-        or ``second``).
+        Their columns, ``decisions`` over both phases; ``run`` and ``phase`` (``first`` or
+        ``second``).
     """
     parts = []
     for folder in sorted((DOCS / "learning_curves").glob("seed_*")):
         before = 0
         for phase, path in (("first", folder / "pretrain"), ("second", folder)):
             curve = read_metrics(path / "evaluation.csv")
-            labels = {"run": pl.lit(folder.name), "phase": pl.lit(phase)}
-            parts.append(curve.select(pl.col("decisions") + before, "mean_reward", **labels))
+            counted = curve.with_columns(pl.col("decisions") + before)
+            parts.append(counted.with_columns(run=pl.lit(folder.name), phase=pl.lit(phase)))
             # The second phase goes on counting where the first one ended.
             before = curve["decisions"][-1]
     return pl.concat(parts, how="vertical_relaxed")

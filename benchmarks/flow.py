@@ -91,20 +91,18 @@ def measure(
     courtesy: float = MobilParameters.courtesy,
 ) -> Passed:
     """Until so many ``vehicles`` have left, in all :data:`ROWS` together; ``courtesy`` in m/s2."""
-    exit_share = EXIT_SHARE if scene == "weave" else 0.0
     flow = {
         "vph": VPH,
         "ramp_vph": RAMP_VPH,
-        "exit_share": exit_share,
+        "exit_share": EXIT_SHARE if scene == "weave" else 0.0,
         "from_m": FROM_M,
         "to_m": TO_M,
         "slots": SLOTS,
     }
-    drivers = {"courtesy": courtesy}
-    config = make(EnvConfig, {"name": scene, "flow": flow, "mobil": drivers, "timeout_s": 1e6})
+    changed = {"name": scene, "flow": flow, "mobil": {"courtesy": courtesy}, "timeout_s": 1e6}
+    config = make(EnvConfig, changed)
     module = make_traffic(make(TrafficConfig, traffic), config)
-    env = make_env(module, DrivingConfig(env=config), ROWS)
-    base = env.base_env
+    base = make_env(module, DrivingConfig(env=config), ROWS).base_env
     road = base.road
     passed = Passed(scene, traffic, lanes=config.lanes - 1)
     exits = torch.tensor(road.flow.exits(base.vehicles))

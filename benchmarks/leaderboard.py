@@ -82,8 +82,10 @@ def table(document: str) -> str:
     Of an entry that was driven with one training and with several the latter counts.
     """
     only, columns = PAGES[document]
-    results = [content for name, content in stored().items() if only in (None, name)]
-    driven = [entry for content in results for entry in content["entries"]]
+    driven = []
+    for name, content in stored().items():
+        if only in (None, name):
+            driven += content["entries"]
     entries: dict[str, Results] = {}
     for entry in sorted(driven, key=lambda entry: -entry["trainings"]):
         entries.setdefault(entry["entry"], entry)

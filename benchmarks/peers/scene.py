@@ -149,7 +149,7 @@ LAW = Law()
 BRAKE = 2.0 * math.sqrt(TABLE_V.max_acceleration * TABLE_V.comfortable_deceleration)
 
 
-def acceleration(speed: Array, gap: Array, leader_speed: Array, law: Law = LAW) -> Array:
+def acceleration(speed: Array, gap: Array, leader_speed: Array, law: Law) -> Array:
     """IDM acceleration in m/s2, in NumPy and apart from the package's tensor code; all [..., M]."""
     p = TABLE_V
     dynamic = speed * p.headway_s + speed * (speed - leader_speed) / BRAKE
@@ -168,7 +168,7 @@ def equilibrium_gap(speed_mps: float, law: Law = LAW) -> float:
     return wanted / math.sqrt(1.0 - (speed_mps / DESIRED_SPEED_MPS) ** 4) - law.offset_m
 
 
-def ahead(trace: Trace, law: Law = LAW) -> tuple[Array, Array]:
+def ahead(trace: Trace, law: Law) -> tuple[Array, Array]:
     """Net gap ahead of each vehicle and the speed of whoever is there, [T, M].
 
     The first one sees nobody.

@@ -50,7 +50,7 @@ class Slopes(NamedTuple):
     leader: Array
 
 
-def slopes(speed: Array, gap: Array, leader_speed: Array, law: Law = LAW) -> Slopes:
+def slopes(speed: Array, gap: Array, leader_speed: Array, law: Law) -> Slopes:
     """Derivatives of :func:`~benchmarks.peers.scene.acceleration`.
 
     0 where it is cut to Table V's bounds.
@@ -132,7 +132,7 @@ def largest(values: Array) -> float:
     return float(np.abs(values).max(initial=0.0))
 
 
-def unsettled_gap_m(trace: Trace, law: Law = LAW) -> float:
+def unsettled_gap_m(trace: Trace, law: Law) -> float:
     """How far the last gaps may still be from the equilibrium gap, from the motion that is left at
     the end, m.
 

@@ -101,8 +101,7 @@ class OnRamp:
         import libsumo
 
         env: HighwayEnv = ganlane.make_env(env="on_ramp", num_envs=1, seed=SEED).base_env
-        self.goal_m = env.episode.goal_m
-        self.timeout_s = env.episode.timeout_s
+        self.episode = env.episode
         self.sumo: Any = libsumo
         # SUMO reads its files when it starts, and the state at every reset.
         self._folder = tempfile.TemporaryDirectory()
@@ -131,7 +130,8 @@ class OnRamp:
         for _ in range(STEPS):
             self.sumo.simulationStep()
         driven_s = self.sumo.simulation.getTime() - self._started_s
-        if self.sumo.vehicle.getDistance(EGO) > self.goal_m or driven_s > self.timeout_s:
+        at_goal = self.sumo.vehicle.getDistance(EGO) > self.episode.goal_m
+        if at_goal or driven_s > self.episode.timeout_s:
             self.reset()
 
 

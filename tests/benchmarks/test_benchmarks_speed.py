@@ -110,7 +110,7 @@ def test_sumo_drives_our_on_ramp_until_its_ego_is_at_the_goal():
         ramp.step(keys.KEEP)
         seconds += 1
     # At the goal it starts anew; on the way the ramp's vehicles have merged.
-    assert 1000 / 23 < seconds < ramp.timeout_s
+    assert 1000 / 23 < seconds < ramp.episode.timeout_s
     assert start_on_ramp()(3) == 30
 
 

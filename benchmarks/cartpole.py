@@ -29,7 +29,7 @@ from torchrl.envs import EnvBase, GymEnv, SerialEnv
 from benchmarks.script import ReportSection, add_report, make_parser, markdown, run_script
 from ganlane.agents import GreedyPolicy, Rainbow, RainbowConfig
 from ganlane.evaluation.table import Table
-from ganlane.settings.train import LoggerConfig, TrainConfig
+from ganlane.settings.train import TrainConfig
 from ganlane.training.loop import train
 
 SECTION = "cartpole"
@@ -128,7 +128,6 @@ def run(seed: int) -> Outcome:
         log_every=EVERY,
         evaluate_every=EVERY,
         checkpoint_every_s=1e9,
-        logger=LoggerConfig(),
     )
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(Solved):
         result = train(make_env(seed), agent, config, folder, evaluate, logs=[outcome])

@@ -149,8 +149,9 @@ def table_of(results: list[Passed]) -> Table:
     lines = []
     for one in results:
         missed = one.missed if one.scene == "weave" else "-"
-        numbers = (one.left, one.by_exit, missed, round(one.vph_per_lane))
-        lines.append([one.scene, one.traffic, *map(str, (*numbers, one.longest_s, one.last_s))])
+        flow = round(one.vph_per_lane)
+        numbers = (one.left, one.by_exit, missed, flow, one.longest_s, one.last_s)
+        lines.append([one.scene, one.traffic, *map(str, numbers)])
     heads = ["scene", "traffic", "left", "by exit", "missed", "veh/h/lane", "stood, s", "last, s"]
     slow, fast = (largest_flow(IdmParameters(), speed) for speed in DESIRED_MPS)
     note = (

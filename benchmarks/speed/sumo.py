@@ -100,7 +100,7 @@ class OnRamp:
     def __init__(self) -> None:
         import libsumo
 
-        env: HighwayEnv = ganlane.make_env(env="on_ramp", num_envs=1, seed=SEED).base_env
+        env: HighwayEnv = ganlane.make_env(env="on_ramp", seed=SEED).base_env
         self.episode = env.episode
         self.sumo: Any = libsumo
         # SUMO reads its files when it starts, and the state at every reset.

@@ -43,9 +43,7 @@ BATCH = 1024
 #: The highest learning rate.
 RATE = 2e-3
 #: Share of drivers with the noise of another sensor besides.
-OTHER_SENSORS = 0.4
-#: Drivers are up to this much faster than recorded, m/s.
-FASTER_MPS = 15.0
+OTHER_SHARE = 0.4
 #: Errors that weigh alike: speed, both accelerations, both lateral speeds, both places.
 SCALES = (0.3, 0.8, 0.8, 0.1, 0.1, 0.05, 0.05)
 
@@ -190,17 +188,21 @@ def present_memory(motion: Tensor, age: Tensor) -> Memory:
 
 
 def fit_estimator(
-    estimator: Estimator, scenes: Sequence[SmoothScene], random: torch.Generator
+    estimator: Estimator,
+    scenes: Sequence[SmoothScene],
+    faster_mps: float,
+    random: torch.Generator,
 ) -> None:
     """Fit the estimator to these scenes, which hold the recorded and the smoothed positions.
 
     What it is to find is the motion of the smoothed track, under none, some or all of the recorded
-    noise. It needs no gradients afterwards.
+    noise, and in part of the rows that of other sensors besides. It needs no gradients afterwards.
 
     Args:
         estimator: it is changed in place.
         scenes: recordings, smoothed.
-        random: draws drivers, shares of the noise, and sides.
+        faster_mps: drivers are faster than recorded by up to this much, m/s.
+        random: draws drivers, their noise, speeds and sides.
     """
     raw, smooth, motion = _tracks(scenes)
     optimizer = torch.optim.Adam(estimator.parameters(), RATE)
@@ -214,10 +216,10 @@ def fit_estimator(
         positions = smooth[rows] + share * (raw[rows] - smooth[rows])
 
         # On other roads sensors and speeds are others.
-        other = torch.rand((BATCH, 1, 1), generator=random) < OTHER_SENSORS
+        other = torch.rand((BATCH, 1, 1), generator=random) < OTHER_SHARE
         noise = other_noise(BATCH, OBSERVED_POSITIONS, random)
         positions = positions + torch.where(other, noise, 0.0)
-        faster = FASTER_MPS * torch.rand((BATCH, 1), generator=random)
+        faster = faster_mps * torch.rand((BATCH, 1), generator=random)
         positions[..., 0] += faster * (PHYSICS_STEP_S * torch.arange(1 - OBSERVED_POSITIONS, 1))
 
         # The last two numbers are the error of the last position.

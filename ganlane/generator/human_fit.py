@@ -69,8 +69,9 @@ PRIOR_VEHICLES = 8
 
 #: Above this speed, m/s, recordings that were sped up are silent, too.
 FASTEST_MPS = 30.0
-# How drivers of the prior follow. On US-101 the acceleration over the next two seconds is 0.39,
-# 0.23 and 0.07 times the speed difference, at gaps of 5, 20 and 55 m.
+# How drivers of the prior follow. On US-101 the acceleration over the next two seconds is 0.41,
+# 0.23 and 0.06 times the speed difference, at gaps around 5, 20 and 55 m
+# (python -m benchmarks.human_fits responses).
 #: The response to a speed difference is this by the gap, m/s, and at most that, 1/s.
 CLOSING_GAIN_MPS = 4.5
 LARGEST_CLOSING_GAIN = 0.4
@@ -182,7 +183,7 @@ def fit_human(
         # The estimator learns from recorded noise, and to leave exact positions as they are.
         scenes = [smooth_scene(recording, config) for recording in recordings]
         exact = [without_noise(recording, config) for recording in recordings]
-        fit_estimator(model.estimator, [*scenes, *exact], random)
+        fit_estimator(model.estimator, [*scenes, *exact], config.faster_mps, random)
 
         # Files of one lane show no motion across the road, so the estimator does without them.
         scenes += [smooth_scene(one, config, ONE_LANE_WEIGHT) for one in following]
@@ -437,7 +438,7 @@ def match_rate(policy: HumanPolicy, choices: Choices, driven: LaneChoice | None 
 
 
 class PriorDrivers(NamedTuple):
-    """IDM drivers in random scenes, [N, M] each; ``vehicles`` do not accelerate yet.
+    """Drivers in random scenes, [N, M] each; ``vehicles`` do not accelerate yet.
 
     Attributes:
         vehicles: where they are, how fast, and where they head for.
@@ -543,7 +544,7 @@ def prior_acceleration(vehicles: Vehicles, road: Road, headway: Tensor) -> Tenso
 
 @torch.no_grad()
 def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[Moves, Tensor]:
-    """What recordings do not show: moves of IDM drivers, and lane changes into danger.
+    """What recordings do not show: moves of the prior's drivers, and lane changes into danger.
 
     Args:
         random: draws drivers, and what they have done so far.

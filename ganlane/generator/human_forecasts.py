@@ -68,7 +68,7 @@ CHANGING_MPS = 0.35
 #: Shares of the recorded noise; every scene is used with each of them.
 NOISE_SHARES = (0.0, 0.5, 1.0, 1.2)
 #: And so often with the noise of another sensor in its place.
-OTHER_SENSORS = 2
+OTHER_COPIES = 2
 #: Frames between the starts of two windows.
 OBSERVER_STRIDE = 2
 #: Windows of an update.
@@ -303,7 +303,7 @@ def noisy_scenes(
             recorded.append(_with_noise(exact, share * noise))
 
         frames, vehicles = scene.present.shape
-        for _ in range(OTHER_SENSORS):
+        for _ in range(OTHER_COPIES):
             noise = other_noise(vehicles, frames, random).transpose(0, 1).double().numpy()
             other.append(_with_noise(exact, noise))
     return recorded, other
